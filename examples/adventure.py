@@ -1,0 +1,74 @@
+"""Another world than robots: a maze of a text adventure. All rooms look alike, and passages twist, so that north and then south
+does not lead back. The player has dropped three things to tell rooms apart. The same solver finds the smallest maze that explains
+what the player typed and read.
+
+    python examples/adventure.py            solves the logged game, and compares the map with the maze
+    python examples/adventure.py --play F   plays the game again and writes its trace to F
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+from pathlib import Path
+
+import networkx as nx
+
+from ssh_abduction import Theory, Trace, solve
+
+HERE = Path(__file__).parent
+COMPASS = ("north", "south", "east", "west")
+ALIKE = "You are in a maze of twisty little passages, all alike."
+ROOMS = {  # what lies there, and the rooms that the passages lead to
+    0: ("A lantern is here.", (1, 3, 2, 0)),
+    1: ("", (4, 0, 1, 5)),
+    2: ("A sword is here.", (3, 5, 0, 2)),
+    3: ("", (0, 2, 4, 1)),
+    4: ("A bottle is here.", (5, 1, 3, 4)),
+    5: ("", (2, 4, 5, 3)),
+}
+
+
+def play(commands: int, seed: int) -> Trace:
+    """A player who wanders at random."""
+    choose = random.Random(seed)
+    room, read, typed = 0, [], []
+    for i in range(commands + 1):
+        read.append(f"{ALIKE} {ROOMS[room][0]}".strip())
+        if i < commands:
+            typed.append(choose.choice(COMPASS))
+            room = ROOMS[room][1][COMPASS.index(typed[-1])]
+    return Trace.from_steps(read, typed, name="A maze of twisty little passages, all alike")
+
+
+def maze() -> nx.MultiDiGraph:
+    """The maze as the graph that a map of it should be."""
+    graph = nx.MultiDiGraph()
+    for room, (thing, exits) in ROOMS.items():
+        graph.add_node(room, view=f"{ALIKE} {thing}".strip())
+        for command, target in zip(COMPASS, exits, strict=True):
+            graph.add_edge(room, target, key=command, action=command)
+    return graph
+
+
+def main() -> None:
+    if sys.argv[1:2] == ["--play"]:
+        play(commands=100, seed=1).save(sys.argv[2])
+        return
+    trace = Trace.load(HERE / "adventure.jsonl")
+    solution = solve(trace, Theory.causal())
+    print(
+        f"{len(trace)} texts read, {len(set(trace.views))} of them different: {solution.cost.dstates} rooms, {solution.count} minimal map(s)"
+    )
+    for ssh_map in solution.maps:
+        same = nx.is_isomorphic(
+            ssh_map.to_networkx(),
+            maze(),
+            node_match=lambda a, b: a["view"] == b["view"],
+            edge_match=lambda a, b: a.keys() == b.keys(),
+        )
+        print("the map is the maze" if same else "the map differs from the maze")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,35 @@
+"""Solve the route that a robot drove through the ACES building, print its minimal maps and what tells them apart, draw one."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.checker import check
+from ssh_abduction.cli.text import describe, differences
+from ssh_abduction.picture import svg
+
+
+def main() -> None:
+    trace = Trace.load(Path(__file__).parent / "aces3-route.jsonl")
+    theory = Theory.topological()
+    solution = solve(trace, theory)
+    cost = solution.cost
+    print(f"{trace.name}: {len(trace)} images, {len(set(trace.views))} views")
+    print(
+        f"fewest: {cost.dstates} dstates, {cost.places} places, {cost.paths} paths; {solution.count} minimal maps, {solution.seconds.total:.2f} s"
+    )
+    for i, ssh_map in enumerate(solution.maps):
+        violations = check(trace, ssh_map, theory)
+        print(f"\nmap {i + 1}: {violations or 'satisfies every axiom'}\n{describe(ssh_map)}")
+    print(f"\nwhat tells them apart\n{differences(solution.maps, trace)}")
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out")
+    folder.mkdir(parents=True, exist_ok=True)
+    picture = folder / "aces3-map.svg"
+    picture.write_text(svg(solution.maps[0]) + "\n", encoding="utf-8")
+    print(f"\nmap 1 is drawn in {picture}")
+
+
+if __name__ == "__main__":
+    main()

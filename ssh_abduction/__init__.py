@@ -1,0 +1,29 @@
+"""From what a robot saw and did, find the map: every minimal map of distinctive states, places and paths."""
+
+from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
+from ssh_abduction.maps import DState, Path, SSHMap
+from ssh_abduction.solver import Bound, Cost, Progress, Search, Solution, Status, solve
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Action, Step, Trace
+
+__all__ = [
+    "Action",
+    "Bound",
+    "Cost",
+    "DState",
+    "MapError",
+    "Path",
+    "Progress",
+    "SSHError",
+    "SSHMap",
+    "Search",
+    "Solution",
+    "SolverError",
+    "Status",
+    "Step",
+    "Theory",
+    "TheoryError",
+    "Trace",
+    "TraceError",
+    "solve",
+]

@@ -1,0 +1,5 @@
+import sys
+
+from ssh_abduction.cli import main
+
+sys.exit(main())

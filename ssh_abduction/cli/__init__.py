@@ -1,0 +1,51 @@
+"""The command line: one module a verb. Maps outcomes to exit codes.
+
+0 done, a minimal map was proven | 1 a known error, one line on stderr | 2 wrong usage | 10 a map without proof | 20 no map satisfies
+the axioms, or a checked map breaks one | 30 nothing in time | 130 interrupted
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+
+from ssh_abduction.cli import check, facts, show, solve, theory
+from ssh_abduction.errors import SSHError
+
+EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of the whole command line."""
+    top = argparse.ArgumentParser(
+        prog="ssh-abduction",
+        description="From what a robot saw and did, find the map.",
+        epilog="Exit codes: 0 minimal map proven; 1 error; 2 usage; 10 map without proof; 20 no map, or a map that breaks an axiom; "
+        "30 nothing in time; 130 interrupted.",
+    )
+    top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
+    verbs = top.add_subparsers(metavar="VERB", required=True)
+    for verb in (solve, check, show, facts, theory):
+        verb.add_parser(verbs)
+    return top
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    options = parser().parse_args(arguments)
+    try:
+        code = int(options.run(options))
+        sys.stdout.flush()
+    except SSHError as error:
+        print(f"ssh-abduction: {error}", file=sys.stderr)
+        return EXIT_ERROR
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read the output has seen enough; what Python still holds back must not raise again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    return code

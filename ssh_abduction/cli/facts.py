@@ -1,0 +1,23 @@
+"""ssh-abduction facts TRACE: the trace as facts for clingo."""
+
+from __future__ import annotations
+
+import argparse
+
+from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.facts import program
+from ssh_abduction.trace import Trace
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = "Print a trace and a theory as the facts that the encodings take, and how to run them."
+    parser = verbs.add_parser("facts", help="print a trace as .lp facts", description=text)
+    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
+    add_theory(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    trace = Trace.load(options.trace)
+    print(program(trace, theory_of(options).resolve(trace)), end="")
+    return 0

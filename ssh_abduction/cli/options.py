@@ -1,0 +1,35 @@
+"""Options that several verbs share: the choice of a theory."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import fields
+from typing import Any
+
+from ssh_abduction.theory import CHOICES, COUNTS, PRESETS, Theory
+
+Verbs = Any  # argparse's type for what add_subparsers returns is private
+
+
+def add_theory(parser: argparse.ArgumentParser) -> None:
+    """Add --theory PRESET, and a flag for each field of Theory to lay over it."""
+    group = parser.add_argument_group("theory", "a preset, and choices laid over it")
+    group.add_argument("--theory", choices=PRESETS, default="topological", help="preset (default: topological)")
+    for name, values in CHOICES.items():
+        group.add_argument(f"--{name.replace('_', '-')}", choices=values)
+    for name, text in (
+        ("symmetric_sides", "a turn says four side relations rather than one"),
+        ("next_place", "a travel leads to the next place of its path"),
+        ("all_on_paths", "every dstate is along a path"),
+    ):
+        group.add_argument(f"--{name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=text)
+    group.add_argument("--prefer", metavar="COUNTS", help=f"what to minimise, first to last, of {', '.join(COUNTS)}; commas between")
+    group.add_argument("--without", metavar="AXIOMS", help="leave these axioms out; commas between")
+
+
+def theory_of(options: argparse.Namespace) -> Theory:
+    """The theory that the options ask for. Raises TheoryError."""
+    chosen = {f.name: getattr(options, f.name) for f in fields(Theory) if getattr(options, f.name, None) is not None}
+    if "prefer" in chosen and not chosen["prefer"]:
+        chosen["prefer"] = ()
+    return PRESETS[options.theory]().replace(**chosen)

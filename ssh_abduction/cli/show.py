@@ -1,0 +1,45 @@
+"""ssh-abduction show MAPS: a map as text, or as a graph for other programs."""
+
+from __future__ import annotations
+
+import argparse
+
+from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.text import describe
+from ssh_abduction.errors import MapError
+from ssh_abduction.maps import maps_of, read_json
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = "Show maps: dstates, places, paths, links."
+    parser = verbs.add_parser("show", help="show maps as text, DOT, GraphML or SVG", description=text)
+    parser.add_argument("maps", help="what solve --json printed, or one saved map")
+    parser.add_argument("--map", type=int, metavar="I", help="only the I-th map, from 1 (default: all as text, the first otherwise)")
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--dot", action="store_true", help="Graphviz DOT: a node a dstate, a cluster a place")
+    form.add_argument("--graphml", action="store_true", help="GraphML: a node a dstate")
+    form.add_argument("--svg", action="store_true", help="a picture: places, and paths as streets through them")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    maps = maps_of(read_json(options.maps), str(options.maps))
+    if options.map is not None and not 1 <= options.map <= len(maps):
+        raise MapError(f"{options.maps}: --map: expected 1 to {len(maps)}, got {options.map}")
+    if not maps:
+        print("no map")
+        return 0
+    chosen = maps[(options.map or 1) - 1]
+    if options.dot:
+        print(chosen.to_dot())
+    elif options.graphml:
+        print(chosen.to_graphml())
+    elif options.svg:
+        from ssh_abduction.picture import svg
+
+        print(svg(chosen))
+    elif options.map:
+        print(describe(chosen))
+    else:
+        print("\n\n".join(f"map {i + 1}\n{describe(m)}" for i, m in enumerate(maps)))
+    return 0

@@ -1,0 +1,152 @@
+"""ssh-abduction solve TRACE: the minimal maps of a trace."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from itertools import islice
+from typing import Any
+
+from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.cli.text import describe, differences
+from ssh_abduction.explain import Explanation, explain
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver import Progress, Search, Solution, Status
+from ssh_abduction.trace import Trace
+
+EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}
+SHOWN = 4  # maps compared on the terminal; --json has all
+
+
+def add_parser(verbs: Verbs) -> None:
+    parser = verbs.add_parser("solve", help="find the minimal maps of a trace", description="Find the minimal maps of a trace.")
+    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
+    parser.add_argument("-n", "--maps", type=int, default=100, metavar="K", help="stop after K maps; 0 for all (default: 100)")
+    parser.add_argument("--json", action="store_true", help="print the solution as JSON, map by map as they are found")
+    parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds with the best answer so far")
+    parser.add_argument("--memory-limit", type=int, metavar="MIB", help="stop when the process has used so much memory")
+    add_theory(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    trace = Trace.load(options.trace)
+    with _progress(trace) as on_progress:
+        search = Search(
+            trace,
+            theory_of(options),
+            limit=options.time_limit,
+            maps=options.maps,
+            memory=options.memory_limit,
+            on_progress=on_progress,
+        )
+        with _interrupts(search):
+            kept = _print_json(search) if options.json else list(_first(search, SHOWN))
+        solution = search.solution(tuple(kept))
+    explanation = explain(trace, solution.theory) if solution.status is Status.UNSATISFIABLE else None
+    if options.json:
+        _print_end(search, solution, explanation)
+    else:
+        _print_text(search, solution, explanation)
+    return 130 if solution.stopped == "interrupted" else EXIT_CODES[solution.status]
+
+
+def _first(search: Search, most: int) -> Iterator[SSHMap]:
+    """The first maps; the others are counted and let go."""
+    maps = iter(search)
+    yield from islice(maps, most)
+    for _ in maps:
+        pass
+
+
+def _print_json(search: Search) -> list[SSHMap]:
+    """The maps, one a line, as they come; none is kept."""
+    head = {"theory": search.theory.to_dict(), "steps": len(search.trace)}
+    sys.stdout.write(_dump(head)[:-1] + ', "maps": [')
+    for i, ssh_map in enumerate(search):
+        sys.stdout.write(("," if i else "") + "\n" + _dump(ssh_map.to_dict()))
+    sys.stdout.write("\n]")
+    return []
+
+
+def _print_end(search: Search, solution: Solution, explanation: Explanation | None) -> None:
+    end: dict[str, Any] = {
+        "status": solution.status.value,
+        "complete": solution.complete,
+        "count": search.count,
+        "cost": solution.cost.to_dict() if solution.cost else None,
+        "bound": solution.bound.to_dict(),
+        "prefix": solution.prefix,
+        "seconds": {k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")},
+    }
+    if solution.stopped:
+        end["stopped"] = solution.stopped
+    if solution.partial:
+        end["partial"] = solution.partial.to_dict()
+    if explanation:
+        end["explanation"] = explanation.to_dict()
+    print("," + _dump(end)[1:])
+
+
+def _dump(value: dict[str, Any]) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def _print_text(search: Search, solution: Solution, explanation: Explanation | None) -> None:
+    if explanation:
+        print(f"{solution.status.value}: {explanation}")
+        return
+    why = f" ({solution.stopped})" if solution.stopped else ""
+    seconds = f"{solution.seconds.total:.2f} s, {solution.prefix} of {solution.steps} steps given to clingo"
+    bound = ", ".join(f"at least {v} {k}" for k, v in solution.bound.to_dict().items())
+    if solution.cost is None:
+        print(f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; any has {bound or 'no proven bound'}; {seconds}")
+        if solution.partial:
+            print(f"\nbest map of the first {len(solution.partial.labels)} steps\n{describe(solution.partial)}")
+        return
+    counts = ", ".join(f"{v} {k}" for k, v in solution.cost.to_dict().items())
+    if solution.status is Status.FEASIBLE:
+        print(f"feasible{why}: {counts}, not proven minimal; any map has {bound or 'no proven bound'}; {seconds}")
+    else:
+        maps = "1 minimal map" if search.count == 1 else f"{search.count} minimal maps"
+        print(f"optimal: {counts}; {maps}{'' if solution.complete else f', and there may be more{why}'}; {seconds}")
+    print(f"\n{'map 1' if search.count > 1 else 'map'}\n{describe(solution.maps[0])}")
+    if len(solution.maps) > 1:
+        some = "" if search.count <= SHOWN else f" (the first {SHOWN}; --json lists all)"
+        print(f"\nwhat tells the maps apart{some}\n{differences(solution.maps, search.trace)}")
+
+
+@contextlib.contextmanager
+def _interrupts(search: Search) -> Iterator[None]:
+    """Ctrl-C ends the search, and what it found is still printed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may handle signals
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: search.interrupt())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _progress(trace: Trace) -> Iterator[Any]:
+    """A line on stderr, while solving, if stderr is a terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status("solving") as status:
+
+        def show(p: Progress) -> None:
+            best = f"best {p.cost.dstates} dstates, {p.cost.places} places, {p.cost.paths} paths" if p.cost else "no map yet"
+            bound = ", ".join(f"{k} ≥ {v}" for k, v in p.bound.to_dict().items()) or "no bound yet"
+            status.update(f"prefix {p.prefix} of {len(trace)} steps; {best}; {bound}; {p.maps} maps; {p.seconds:.1f} s")
+
+        yield show

@@ -1,0 +1,37 @@
+"""ssh-abduction theory: every axiom, and the presets that have it."""
+
+from __future__ import annotations
+
+import argparse
+
+from ssh_abduction import encodings
+from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.text import table
+from ssh_abduction.theory import PRESETS
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = "List every axiom: name, sentence, source, and which presets have it, without and with stars in the trace."
+    parser = verbs.add_parser("theory", help="list the axioms", description=text)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    print("presets: on, or stars (on where the trace has stars), or –")
+    for level in encodings.LEVELS:
+        print(f"\n{level}")
+        rows = [
+            [axiom.name, *(_state(axiom.name, preset) for preset in PRESETS), axiom.sentence, f"[{axiom.source}]"]
+            for axiom in encodings.axioms()
+            if axiom.level == level
+        ]
+        print(table(["axiom", *PRESETS, "sentence", "source"], rows))
+    print(f"\nThe encodings are in {encodings.folder()}")
+    return 0
+
+
+def _state(name: str, preset: str) -> str:
+    theory = PRESETS[preset]()
+    if name in theory.axioms:
+        return "on"
+    return "stars" if theory.star == "auto" and name in theory.replace(star="frame").axioms else "–"

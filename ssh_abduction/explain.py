@@ -1,0 +1,129 @@
+"""Why a trace has no map: the shortest stretch of it that has none, and a smallest set of axioms and steps that clash there.
+
+>>> from ssh_abduction import Theory, Trace
+>>> from ssh_abduction.explain import explain
+>>> trace = Trace.from_steps(views=["a", "b", "c", "d"], actions=["travel", "around", "around"])
+>>> explanation = explain(trace, Theory.topological())
+>>> explanation.first, explanation.last, explanation.axioms[0]
+(0, 3, 'functional_view')
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import clingo
+
+from ssh_abduction import encodings, facts
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Trace
+
+
+@dataclass(frozen=True, slots=True)
+class Clash:
+    """An axiom that cannot hold at all of these steps together with the other clashes. A step is the last one involved."""
+
+    axiom: str
+    steps: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """Steps `first` to `last` alone have no map. Dropping any one of the clashes, at any of its steps, would give them one."""
+
+    first: int
+    last: int
+    clashes: tuple[Clash, ...]
+
+    @property
+    def axioms(self) -> tuple[str, ...]:
+        """The names of the axioms that clash."""
+        return tuple(clash.axiom for clash in self.clashes)
+
+    def __str__(self) -> str:
+        parts = [f"{c.axiom} ({'step' if len(c.steps) == 1 else 'steps'} {', '.join(map(str, c.steps))})" for c in self.clashes]
+        return f"no map satisfies the axioms: in steps {self.first} to {self.last} these clash: {', '.join(parts)}"
+
+    def to_dict(self) -> dict[str, object]:
+        return {"first": self.first, "last": self.last, "clashes": [{"axiom": c.axiom, "steps": list(c.steps)} for c in self.clashes]}
+
+
+def explain(trace: Trace, theory: Theory | None = None) -> Explanation | None:
+    """Why the trace has no map under a theory, or None if it has one.
+
+    The stretch is found by dropping steps from the end and from the start, the clashes by dropping axioms one by one.
+    """
+    theory = (theory or Theory.topological()).resolve(trace)
+    whole = len(trace)
+    length = _shortest(whole, lambda n: not _Axioms(_stretch(trace, 0, n), theory).consistent())
+    if length is None:
+        return None
+    last = length - 1
+    length = _shortest(length, lambda n: not _Axioms(_stretch(trace, last + 1 - n, n), theory).consistent()) or length
+    first = last + 1 - length
+    clashes: dict[str, list[int]] = {}
+    for axiom, step in _Axioms(_stretch(trace, first, length), theory, relaxed=True).smallest_clash():
+        clashes.setdefault(axiom, []).append(first + step)
+    order = [axiom.name for axiom in encodings.axioms()]
+    found = tuple(Clash(name, tuple(sorted(clashes[name]))) for name in sorted(clashes, key=order.index))
+    return Explanation(first, last, found)
+
+
+def _stretch(trace: Trace, first: int, length: int) -> Trace:
+    head = trace.prefix(first + length)
+    return replace(head, steps=head.steps[first:])
+
+
+def _shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:
+    """The least length with no map, as more steps never bring one back; None if even the longest has one."""
+    short, long = 0, 1
+    while not has_no_map(long):
+        if long == longest:
+            return None
+        short, long = long, min(2 * long, longest)
+    while long - short > 1:
+        middle = (short + long) // 2
+        short, long = (short, middle) if has_no_map(middle) else (middle, long)
+    return long
+
+
+class _Axioms:
+    """A trace and its axioms in clingo; where `relaxed`, each axiom can be switched at each step."""
+
+    def __init__(self, trace: Trace, theory: Theory, relaxed: bool = False) -> None:
+        self._control = clingo.Control(["--warn=none"])
+        names = [name for name in facts.encoding_names(theory) if name not in ("preference", "show")]
+        for name in [*names, "explain"] if relaxed else names:
+            self._control.load(encodings.path(name))
+        last = len(trace) - 1
+        self._control.add("base", [], facts.theory_facts(theory) + facts.trace_facts(trace, theory, 0, len(trace)))
+        steps = [("step", facts.step_number(t)) for t in range(len(trace))]
+        self._control.ground([("base", []), *steps, ("check", facts.step_number(last))])
+        self._control.assign_external(facts.query(last), True)
+        self._pairs = {facts.active(axiom, t): (axiom, t) for axiom in theory.axioms for t in range(len(trace))} if relaxed else {}
+
+    def consistent(self, active: Sequence[clingo.Symbol] = ()) -> bool:
+        """Whether there is a map. Where the axioms are relaxed, those hold that are active."""
+        return bool(self._control.solve(assumptions=[(symbol, True) for symbol in active]).satisfiable)
+
+    def smallest_clash(self) -> list[tuple[str, int]]:
+        """Pairs of axiom and step that leave no map, while any proper subset of them does.
+
+        There are many such sets. Dropping whole axioms before single steps, from either end, and keeping the smallest result
+        gives one that is short to read.
+        """
+        found = [self._shrunk(list(order)) for order in (self._pairs, reversed(self._pairs))]
+        shortest = min(found, key=lambda pairs: (len({self._pairs[p][0] for p in pairs}), len(pairs)))
+        return [self._pairs[symbol] for symbol in shortest]
+
+    def _shrunk(self, kept: list[clingo.Symbol]) -> list[clingo.Symbol]:
+        for axiom in dict.fromkeys(self._pairs[symbol][0] for symbol in kept):
+            fewer = [symbol for symbol in kept if self._pairs[symbol][0] != axiom]
+            if not self.consistent(fewer):
+                kept = fewer
+        for symbol in tuple(kept):
+            fewer = [other for other in kept if other != symbol]
+            if not self.consistent(fewer):
+                kept = fewer
+        return kept

@@ -1,0 +1,263 @@
+"""Maps: distinctive states, the links between them, places, and paths with the order of their places.
+
+Maps are values. dstates, places and paths are numbered by first visit, and a path's direction +1 is the one in which it was
+first faced. So two maps of one trace are the same map, up to renaming, exactly when they are equal. Equality looks at the
+dstates, their places and courses, and the links. The order of a path, the headings and the excused pairs are witnesses, one
+of possibly several that show the map to be consistent, and do not count.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Any, Literal
+
+from ssh_abduction.errors import MapError, brief
+from ssh_abduction.trace import View
+
+if TYPE_CHECKING:
+    import networkx as nx
+
+
+@dataclass(frozen=True, slots=True)
+class DState:
+    """A distinctive state: a position and a heading that hill-climbing brings the robot to.
+
+    place and path are None where the theory has none; `direction` is +1 or -1, the way the dstate faces along its path;
+    `heading` is the slot (0 to 3, clockwise) of the place's frame that it faces, in theories with star=frame.
+    """
+
+    id: int
+    view: View
+    place: int | None = None
+    path: int | None = None
+    direction: int | None = None
+    heading: int | None = field(default=None, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """A street: its places in an order that goes with direction +1. With path_order=partial, one order of several."""
+
+    id: int
+    order: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SSHMap:
+    """One explanation of a trace.
+
+    labels   the dstate of each step
+    links    (dstate, action name, dstate) for each action tried in each dstate
+    excused  pairs of paths that the default side_of_branch is not applied to (boundary=defeasible only)
+    """
+
+    labels: tuple[int, ...]
+    dstates: tuple[DState, ...]
+    links: tuple[tuple[int, str, int], ...]
+    places: tuple[int, ...] = ()
+    paths: tuple[Path, ...] = field(default=(), compare=False)
+    excused: tuple[tuple[int, int], ...] = field(default=(), compare=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The map as plain data, as `solve --json` prints it (docs/formats.md)."""
+        data: dict[str, Any] = {
+            "labels": list(self.labels),
+            "dstates": [
+                {
+                    "id": s.id,
+                    "view": s.view,
+                    "place": s.place,
+                    "path": s.path,
+                    "direction": s.direction,
+                    **({} if s.heading is None else {"heading": s.heading}),
+                }
+                for s in self.dstates
+            ],
+            "links": [list(link) for link in self.links],
+            "places": list(self.places),
+            "paths": [{"id": p.id, "order": list(p.order)} for p in self.paths],
+        }
+        if self.excused:
+            data["excused"] = [list(pair) for pair in self.excused]
+        return data
+
+    @classmethod
+    def from_dict(cls, data: Any, where: str = "map") -> SSHMap:
+        """The map that `to_dict` wrote. Raises MapError with the field that is wrong."""
+        read = _Reader(where)
+        record = read.mapping(data, "")
+        dstates = tuple(read.dstate(s, f"dstates[{i}]") for i, s in enumerate(read.list(record, "dstates")))
+        ids = {s.id for s in dstates}
+        places = tuple(read.integer(p, f"places[{i}]") for i, p in enumerate(read.list(record, "places", optional=True)))
+        paths = tuple(read.path(p, f"paths[{i}]") for i, p in enumerate(read.list(record, "paths", optional=True)))
+        if [s.id for s in dstates] != list(range(len(dstates))):
+            raise MapError(
+                f"{where}: dstates: expected the ids 0, 1, 2, … in this order, got {brief([s.id for s in dstates])}; renumber them"
+            )
+        for name, known, used in (
+            ("places", set(places), {s.place for s in dstates} | {q for p in paths for q in p.order}),
+            ("paths", {p.id for p in paths}, {s.path for s in dstates}),
+        ):
+            if missing := used - known - {None}:
+                raise MapError(f"{where}: {name}: expected every id that is used, got none for {brief(sorted(missing, key=str))}; add it")
+        labels = tuple(read.integer(x, f"labels[{i}]") for i, x in enumerate(read.list(record, "labels")))
+        for i, label in enumerate(labels):
+            if label not in ids:
+                raise MapError(f"{where}: labels[{i}]: expected the id of a dstate, got {label}; there are {len(dstates)} dstates")
+        links = tuple(read.link(x, ids, f"links[{i}]") for i, x in enumerate(read.list(record, "links")))
+        excused = tuple(read.pair(x, f"excused[{i}]") for i, x in enumerate(read.list(record, "excused", optional=True)))
+        return cls(labels, dstates, links, places, paths, excused)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the map as JSON. Raises MapError."""
+        try:
+            FilePath(path).write_text(json.dumps(self.to_dict(), ensure_ascii=False) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise MapError(f"{path}: cannot write the map: {error.strerror or error}; check the folder") from None
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> SSHMap:
+        """The map that `save` wrote. Raises MapError."""
+        return cls.from_dict(read_json(path), str(path))
+
+    def to_networkx(self, level: Literal["causal", "topological"] = "causal") -> nx.Graph[Any]:
+        """The map as a graph of networkx.
+
+        causal        MultiDiGraph: a node a dstate (view, place, path, direction), an edge a link (action)
+        topological   Graph: nodes ("place", p) and ("path", h), an edge where the place is on the path (index in its order)
+        """
+        import networkx as nx
+
+        if level == "causal":
+            causal: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
+            for s in self.dstates:
+                facts = {"view": s.view, "place": s.place, "path": s.path, "direction": s.direction, "heading": s.heading}
+                causal.add_node(s.id, **{k: v for k, v in facts.items() if v is not None})
+            for source, action, target in self.links:
+                causal.add_edge(source, target, key=action, action=action)
+            return causal
+        if level != "topological":
+            raise MapError(f'level: expected "causal" or "topological", got {brief(level)}')
+        bipartite: nx.Graph[Any] = nx.Graph()
+        bipartite.add_nodes_from((("place", p) for p in self.places), bipartite=0)
+        bipartite.add_nodes_from((("path", p.id) for p in self.paths), bipartite=1)
+        for path in self.paths:
+            for index, place in enumerate(path.order):
+                bipartite.add_edge(("place", place), ("path", path.id), index=index)
+        return bipartite
+
+    def to_graphml(self) -> str:
+        """The causal graph as GraphML text."""
+        import networkx as nx
+
+        return "\n".join(nx.generate_graphml(self.to_networkx()))
+
+    def to_dot(self) -> str:
+        """The causal graph as Graphviz DOT text, with a cluster a place."""
+
+        def quoted(text: object) -> str:
+            return '"' + str(text).replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n") + '"'
+
+        def node(s: DState) -> str:
+            course = "" if s.path is None else f"\npath {s.path}{'+' if s.direction == 1 else '-'}"
+            return f"{s.id} [label={quoted(f'{s.id}: {s.view}{course}')}];"
+
+        lines = ["digraph map {", "  node [shape=box, style=rounded];"]
+        lines += [f"  {node(s)}" for s in self.dstates if s.place is None]
+        for p in self.places:
+            inside = " ".join(node(s) for s in self.dstates if s.place == p)
+            lines.append(f"  subgraph cluster_{p} {{ label={quoted(f'place {p}')}; {inside} }}")
+        lines += [f"  {source} -> {target} [label={quoted(action)}];" for source, action, target in self.links]
+        return "\n".join([*lines, "}"])
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """The JSON value in a file. Raises MapError that names the file and the line."""
+    try:
+        return json.loads(FilePath(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise MapError(f"{path}: expected a readable file of maps: {error.strerror or error}; check the path") from None
+    except json.JSONDecodeError as error:
+        raise MapError(
+            f"{path}:{error.lineno}: expected JSON, got broken JSON at column {error.colno} ({error.msg}); write it with solve --json"
+        ) from None
+    except (UnicodeDecodeError, RecursionError):
+        raise MapError(f"{path}: expected JSON in UTF-8, got something else; write it with solve --json") from None
+
+
+def maps_of(data: Any, where: str) -> list[SSHMap]:
+    """The maps in the JSON of `solve --json`, or the one map in the JSON of `SSHMap.save`. Raises MapError."""
+    if isinstance(data, Mapping) and "maps" in data:
+        if not isinstance(data["maps"], list):
+            raise MapError(f"{where}: maps: expected a list, got {brief(data['maps'])}; write it with solve --json")
+        return [SSHMap.from_dict(m, f"{where}: maps[{i}]") for i, m in enumerate(data["maps"])]
+    return [SSHMap.from_dict(data, where)]
+
+
+class _Reader:
+    """Checks the fields of a map, and says which one is wrong."""
+
+    def __init__(self, where: str) -> None:
+        self.where = where
+
+    def wrong(self, name: str, expected: str, value: Any) -> MapError:
+        return MapError(f"{self.where}: {name or 'map'}: expected {expected}, got {brief(value)}; write it with solve --json")
+
+    def mapping(self, value: Any, name: str) -> Mapping[str, Any]:
+        if not isinstance(value, Mapping):
+            raise self.wrong(name, "an object", value)
+        return value
+
+    def list(self, record: Mapping[str, Any], name: str, optional: bool = False) -> list[Any]:
+        value = record.get(name, [] if optional else None)
+        if not isinstance(value, list):
+            raise self.wrong(name, "a list", value)
+        return value
+
+    def integer(self, value: Any, name: str) -> int:
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise self.wrong(name, "an integer", value)
+        return value
+
+    def optional(self, value: Any, name: str) -> int | None:
+        return None if value is None else self.integer(value, name)
+
+    def dstate(self, value: Any, name: str) -> DState:
+        record = self.mapping(value, name)
+        view = record.get("view")
+        if isinstance(view, bool) or not isinstance(view, str | int):
+            raise self.wrong(f"{name}.view", "a text or an integer", view)
+        direction = self.optional(record.get("direction"), f"{name}.direction")
+        path = self.optional(record.get("path"), f"{name}.path")
+        if direction not in (None, 1, -1) or (direction is None) != (path is None):
+            raise self.wrong(f"{name}.direction", "1 or -1 where there is a path, null elsewhere", direction)
+        heading = self.optional(record.get("heading"), f"{name}.heading")
+        if heading not in (None, 0, 1, 2, 3):
+            raise self.wrong(f"{name}.heading", "0 to 3", heading)
+        return DState(
+            self.integer(record.get("id"), f"{name}.id"),
+            view,
+            self.optional(record.get("place"), f"{name}.place"),
+            path,
+            direction,
+            heading,
+        )
+
+    def path(self, value: Any, name: str) -> Path:
+        record = self.mapping(value, name)
+        order = self.list(record, "order")
+        return Path(self.integer(record.get("id"), f"{name}.id"), tuple(self.integer(p, f"{name}.order[{i}]") for i, p in enumerate(order)))
+
+    def link(self, value: Any, ids: set[int], name: str) -> tuple[int, str, int]:
+        if not (isinstance(value, list) and len(value) == 3 and isinstance(value[1], str) and value[0] in ids and value[2] in ids):
+            raise self.wrong(name, "[dstate, action name, dstate]", value)
+        return value[0], value[1], value[2]
+
+    def pair(self, value: Any, name: str) -> tuple[int, int]:
+        if not (isinstance(value, list) and len(value) == 2):
+            raise self.wrong(name, "[path, path]", value)
+        return self.integer(value[0], name), self.integer(value[1], name)

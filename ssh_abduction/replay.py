@@ -1,0 +1,67 @@
+"""Run a trace over a map in linear time: what the map predicts holds, is contradicted, or is unknown to it.
+
+A map made for the first steps of a trace says of each action tried in a dstate where it leads, and of each dstate what was
+seen there. Replay follows the rest of the trace through these links. It restates no axiom: where it meets an action never
+tried in the dstate, or something never seen there, it stops and leaves the judgement to the solver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Trace
+
+
+class Outcome(Enum):
+    """How a replay ended."""
+
+    PREDICTED = "predicted"  # every step of the trace is explained
+    CONTRADICTED = "contradicted"  # the dstate reached shows something else
+    UNKNOWN = "unknown"  # the action was never tried in the dstate
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """`labels` of the steps explained, and the `outcome`. Where it is not PREDICTED, step len(labels) is the one that failed."""
+
+    labels: tuple[int, ...]
+    outcome: Outcome
+
+
+class Log:
+    """A trace as integers, made once and replayed over many maps.
+
+    actions   which action was done at each step
+    seen      which observation was made: the view, with the star where the theory uses stars
+    """
+
+    def __init__(self, trace: Trace, theory: Theory) -> None:
+        with_star = theory.star in ("pattern", "frame")
+        actions: dict[str, int] = {}
+        seen: dict[object, int] = {}
+        self.actions = [actions.setdefault(a.name, len(actions)) for a in trace.actions]
+        self.seen = [seen.setdefault((step.view, type(step.view), step.openings if with_star else None), len(seen)) for step in trace.steps]
+
+    def replay(self, labels: Sequence[int], known: int | None = None) -> Replay:
+        """Replay the trace over the map that `labels` make of its first steps; `known` of them make links (default all)."""
+        actions, seen = self.actions, self.seen
+        known = len(labels) if known is None else known
+        links = {(labels[t], actions[t]): labels[t + 1] for t in range(known - 1)}
+        sights = {(labels[t], seen[t]) for t in range(known)}
+        found = list(labels[:known])
+        label = found[-1]
+        outcome = Outcome.PREDICTED
+        for t in range(known, len(seen)):
+            following = links.get((label, actions[t - 1]))
+            if following is None:
+                outcome = Outcome.UNKNOWN
+                break
+            if (following, seen[t]) not in sights:
+                outcome = Outcome.CONTRADICTED
+                break
+            label = following
+            found.append(label)
+        return Replay(tuple(found), outcome)

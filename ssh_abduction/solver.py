@@ -1,0 +1,492 @@
+"""Every minimal map of a trace.
+
+>>> from ssh_abduction import Theory, Trace, solve
+>>> trace = Trace.from_steps(views=["end", "end", "end"], actions=["travel", "around"])
+>>> solution = solve(trace, Theory.topological())
+>>> solution.status.value, solution.cost.dstates, solution.complete
+('optimal', 3, True)
+
+Solving for a prefix, replaying to the end
+------------------------------------------
+Grounding the axioms for a whole trace costs more than the square of its length, but once a map is closed the rest of the trace
+only re-traverses it. So `Search` solves for a prefix, replays the maps found over the whole trace (`replay.py`), and extends the
+prefix, in the same clingo control, while a replay stops early. This is exact.
+
+*Claim.* Let every minimal map of a prefix, of cost c, replay to the end of the trace. Then the replayed maps are exactly the
+minimal maps of the trace, and c is their cost.
+
+*Proof.* (1) A map of the trace, cut down to the prefix, is a map of the prefix: every axiom forbids a pattern of links,
+observations and names, and a cut takes patterns away; what the axioms ask for (a course, an order, a side, a heading) the map
+of the trace has, and a course that only a later travel supports is dropped together with that travel. Cutting takes no
+dstate, place, path or excuse in, so no count grows: the prefix's minimum bounds that of the trace from below.
+(2) A map that replays to the end has, over the whole trace, the links and observations that it has over the prefix. The axioms
+speak of nothing else, so the replayed map satisfies them, at cost c. By (1), c is the minimum.
+(3) A minimal map F of the trace has cost c by (2). Cut down to the prefix it costs at most c in every count, and at least c in
+the order of preference by (1), so it is one of the prefix's minimal maps, R. As actions are deterministic and replaying R meets
+only links of R, F has the labels of the replayed R, the same links, and so the same support for every course: F is
+the replayed R. Different R replay to different maps, as they differ on the prefix already. ∎
+
+A map of the prefix that stops early is no answer; what its continuations are, the longer prefix says. The claim needs
+determinism, and that a dstate has one place, course and heading. A theory `without` axioms is therefore solved in one go.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any, Literal, TypeAlias
+
+import clingo
+
+from ssh_abduction import encodings, facts
+from ssh_abduction.errors import SolverError, brief
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.replay import Log, Outcome
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Trace
+
+FIRST_PREFIX = 8  # steps; short enough that solving it costs next to nothing
+GROWTH = 1.25  # a prefix grows at least by this factor, so that there are few
+HELD_BACK = 1000  # maps kept until a prefix proves long enough; from there on they stream
+RESERVE = 0.2  # share of the time limit kept for finding any map of the whole trace
+POLL = 0.05  # seconds between looks at the clock and for Ctrl-C
+TICK = 0.5  # seconds between reports of progress while clingo is busy
+
+Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
+
+
+class Status(Enum):
+    """What is known about the trace."""
+
+    OPTIMAL = "optimal"  # minimal maps, proven
+    FEASIBLE = "feasible"  # a map of the whole trace and a bound, but no proof that it is minimal
+    UNSATISFIABLE = "unsatisfiable"  # no map satisfies the axioms, proven
+    UNKNOWN = "unknown"  # stopped before any map of the whole trace was found
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """How many dstates, places, paths and excused pairs of paths a map has."""
+
+    dstates: int
+    places: int
+    paths: int
+    excuses: int = 0
+
+    @staticmethod
+    def of(ssh_map: SSHMap) -> Cost:
+        return Cost(len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.excused))
+
+    def to_dict(self) -> dict[str, int]:
+        counts = {"dstates": self.dstates, "places": self.places, "paths": self.paths}
+        return {**counts, "excuses": self.excuses} if self.excuses else counts
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """Lower bounds, proven, on the counts of every map of the trace; None where nothing is proven.
+
+    The order of preference proves a bound on the count that goes first. The counts after it are bounded only among the maps
+    that are minimal in what goes before: those bounds are in Solution.cost once the status is optimal.
+    """
+
+    dstates: int | None = None
+    places: int | None = None
+    paths: int | None = None
+    excuses: int | None = None
+
+    def to_dict(self) -> dict[str, int]:
+        counts = {"dstates": self.dstates, "places": self.places, "paths": self.paths, "excuses": self.excuses}
+        return {k: v for k, v in counts.items() if v is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class Seconds:
+    """Wall-clock time: in all, for grounding, and for solving."""
+
+    total: float
+    ground: float
+    solve: float
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a search is: the prefix it works on, the best cost and the bound so far, and the maps found."""
+
+    prefix: int
+    steps: int
+    cost: Cost | None
+    bound: Bound
+    maps: int
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The answer for one trace.
+
+    maps       minimal maps (status optimal), or the best one found (feasible)
+    cost       the counts of these maps; None where there is none
+    bound      proven lower bounds on the counts of any map
+    complete   no further minimal map exists
+    theory     the theory, with star settled
+    steps      length of the trace
+    prefix     how many of its first steps had to be given to clingo
+    stopped    why the search ended before it was complete, else None
+    partial    where no map of the whole trace was found: the best map of its first steps
+    """
+
+    status: Status
+    maps: tuple[SSHMap, ...]
+    cost: Cost | None
+    bound: Bound
+    complete: bool
+    theory: Theory
+    steps: int
+    prefix: int
+    seconds: Seconds
+    stopped: Stop | None = None
+    partial: SSHMap | None = None
+
+    @property
+    def count(self) -> int:
+        """How many maps are listed."""
+        return len(self.maps)
+
+
+def solve(
+    trace: Trace,
+    theory: Theory | None = None,
+    *,
+    limit: float | None = None,
+    maps: int = 100,
+    memory: int | None = None,
+    prefixes: bool = True,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Solution:
+    """Find the minimal maps of a trace.
+
+    theory       which axioms and which preference; Theory.topological() by default
+    limit        seconds of wall-clock time; when they are over, the best answer so far is returned
+    maps         list at most so many maps; 0 lists all (take `Search` to stream them)
+    memory       MiB of memory that the process may use at its peak before the search stops
+    prefixes     solve for prefixes and replay (the same answer, faster), or for the whole trace at once
+    on_progress  is told now and then how far the search is
+
+    Ctrl-C ends the search like a limit does. Raises TraceError or TheoryError where the trace lacks what the theory needs.
+    Source: Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
+    """
+    search = Search(trace, theory, limit=limit, maps=maps, memory=memory, prefixes=prefixes, on_progress=on_progress)
+    return search.solution(tuple(search))
+
+
+class Search:
+    """A stream of the minimal maps of a trace, in constant memory. Iterate once; `solution()` says how it ended.
+
+    Parameters as in `solve`.
+    """
+
+    def __init__(
+        self,
+        trace: Trace,
+        theory: Theory | None = None,
+        *,
+        limit: float | None = None,
+        maps: int = 100,
+        memory: int | None = None,
+        prefixes: bool = True,
+        on_progress: Callable[[Progress], None] | None = None,
+    ) -> None:
+        if limit is not None and not limit > 0:
+            raise SolverError(f"limit: expected a number of seconds above 0, got {brief(limit)}; leave it out for none")
+        if maps < 0:
+            raise SolverError(f"maps: expected 0 (all) or more, got {maps}")
+        if memory is not None and memory <= 0:
+            raise SolverError(f"memory: expected a number of MiB above 0, got {brief(memory)}; leave it out for none")
+        self.theory = (theory or Theory.topological()).resolve(trace)
+        self.trace = trace
+        self.status = Status.UNKNOWN
+        self.bound = Bound()
+        self.best: SSHMap | None = None
+        self.partial: SSHMap | None = None
+        self.stopped: Stop | None = None
+        self.complete = False
+        self.count = 0
+        self._most = maps
+        self._log = Log(trace, self.theory)
+        self._whole = not prefixes or bool(self.theory.without)
+        self._on_progress = on_progress
+        self._watch = _Watch(limit, memory, self._report)
+        self._engine = _Engine(trace, self.theory, self._watch)
+
+    @property
+    def prefix(self) -> int:
+        """How many steps clingo was given."""
+        return self._engine.size
+
+    def __iter__(self) -> Iterator[SSHMap]:
+        self._watch.start()
+        try:
+            if self._find_cost():
+                for ssh_map in self._minimal_maps():
+                    if self._most and self.count == self._most:
+                        self.stopped = "maps limit"
+                        return
+                    self.count += 1
+                    self._report()
+                    yield ssh_map
+                self.complete = True
+            elif self.status is Status.UNSATISFIABLE:
+                self.complete = True
+        except _Stopped as stop:
+            self.stopped = stop.reason
+        except KeyboardInterrupt:
+            self.stopped = "interrupted"
+        finally:
+            self._watch.stop()
+        if self.stopped and self.status is not Status.OPTIMAL:
+            if self.best is None and self.stopped == "time limit":
+                self._salvage()
+            if self.best is not None:
+                self.status = Status.FEASIBLE
+        if self.status in (Status.FEASIBLE, Status.OPTIMAL) and not self.count and self.best is not None:
+            self.count = 1
+            yield self.best
+
+    def interrupt(self) -> None:
+        """End the search soon, with the best answer so far. For signal handlers and other threads."""
+        self._watch.interrupted = True
+
+    def solution(self, maps: tuple[SSHMap, ...] = ()) -> Solution:
+        """How the search ended, with the maps that the caller kept."""
+        return Solution(
+            status=self.status,
+            maps=maps,
+            cost=Cost.of(self.best) if self.best else None,
+            bound=self.bound,
+            complete=self.complete,
+            theory=self.theory,
+            steps=len(self.trace),
+            prefix=self.prefix,
+            seconds=Seconds(self._watch.elapsed(), self._engine.ground_seconds, self._engine.solve_seconds),
+            stopped=self.stopped,
+            partial=None if self.best else self.partial,
+        )
+
+    def _find_cost(self) -> bool:
+        """Extend the prefix until a minimal map of it replays to the end. False where the prefix has no map."""
+        steps = len(self.trace)
+        size = steps if self._whole else min(steps, FIRST_PREFIX)
+        while True:
+            self._engine.grow(size)
+            minimal = None
+            for ssh_map in self._engine.improving_maps():
+                minimal = ssh_map
+                self._consider(ssh_map)
+                self._report()
+            if minimal is None:
+                self.status = Status.UNSATISFIABLE
+                return False
+            self.partial = minimal
+            self._raise_bound(minimal)
+            replayed = self._log.replay(minimal.labels)
+            if replayed.outcome is Outcome.PREDICTED:
+                self.best = replace(minimal, labels=replayed.labels)
+                self.status = Status.OPTIMAL
+                self._cost = Cost.of(minimal)
+                return True
+            size = self._extended(len(replayed.labels))
+
+    def _minimal_maps(self) -> Iterator[SSHMap]:
+        """Every map of minimal cost, once, after those of the longest prefix that is needed have been seen to replay."""
+        streamed: list[int] = []  # prefixes whose completely replayed maps went out already
+        while True:
+            held: list[SSHMap] = []
+            stuck = 0
+            streaming = False
+            for ssh_map in self._engine.maps_of_cost(self._cost):
+                replayed = self._log.replay(ssh_map.labels)
+                if replayed.outcome is not Outcome.PREDICTED:
+                    stuck = max(stuck, len(replayed.labels))
+                    if streaming:
+                        continue
+                    break
+                if any(self._log.replay(ssh_map.labels, size).outcome is Outcome.PREDICTED for size in streamed):
+                    continue
+                whole = replace(ssh_map, labels=replayed.labels)
+                if streaming:
+                    yield whole
+                    continue
+                held.append(whole)
+                if len(held) == HELD_BACK:
+                    streaming = True
+                    yield from held
+                    held = []
+            if not stuck:
+                yield from held
+                return
+            if streaming:
+                streamed.append(self.prefix)
+            self._engine.grow(self._extended(stuck))
+
+    def _extended(self, failed: int) -> int:
+        """A longer prefix that holds the step at which a replay failed."""
+        return min(len(self.trace), max(failed + 1, int(self.prefix * GROWTH)))
+
+    def _consider(self, ssh_map: SSHMap) -> None:
+        """Keep a map, not yet proven minimal, if it explains the whole trace and is better than the best so far."""
+        replayed = self._log.replay(ssh_map.labels)
+        if replayed.outcome is Outcome.PREDICTED and (self.best is None or self._rank(ssh_map) < self._rank(self.best)):
+            self.best = replace(ssh_map, labels=replayed.labels)
+
+    def _rank(self, ssh_map: SSHMap) -> tuple[int, ...]:
+        return self._engine.counts(Cost.of(ssh_map))
+
+    def _raise_bound(self, minimal: SSHMap) -> None:
+        if self.theory.priorities:
+            first = self.theory.priorities[0]
+            self.bound = Bound(**{first: getattr(Cost.of(minimal), first)})
+
+    def _salvage(self) -> None:
+        """In the last part of the time limit, look for any map of the whole trace."""
+        self._watch.start(last_part=True)
+        with suppress(_Stopped, KeyboardInterrupt):
+            self._engine.grow(len(self.trace))
+            for ssh_map in self._engine.improving_maps():
+                self._consider(ssh_map)
+        self._watch.stop()
+
+    def _report(self) -> None:
+        if self._on_progress is not None:
+            cost = Cost.of(self.best) if self.best else None
+            self._on_progress(Progress(self.prefix, len(self.trace), cost, self.bound, self.count, self._watch.elapsed()))
+
+
+class _Stopped(Exception):  # noqa: N818 - not an error
+    def __init__(self, reason: Stop) -> None:
+        self.reason = reason
+
+
+class _Watch:
+    """The limits of a search: `check` raises when one is over. Time that the caller of a stream takes does not count."""
+
+    def __init__(self, limit: float | None, memory: int | None, on_tick: Callable[[], None]) -> None:
+        self._on_tick = on_tick
+        self._next_tick = TICK
+        self._limit = limit
+        self._allowed = None if limit is None else limit * (1 - RESERVE)
+        self._memory = memory
+        self._started: float | None = None
+        self._spent = 0.0
+        self.interrupted = False
+
+    def start(self, last_part: bool = False) -> None:
+        if last_part:
+            self._allowed = self._limit
+        self._started = time.perf_counter()
+
+    def stop(self) -> None:
+        self._spent, self._started = self.elapsed(), None
+
+    def elapsed(self) -> float:
+        return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
+
+    def check(self) -> None:
+        if self.interrupted:
+            raise _Stopped("interrupted")
+        if self.elapsed() > self._next_tick:
+            self._next_tick = self.elapsed() + TICK
+            self._on_tick()
+        if self._allowed is not None and self.elapsed() > self._allowed:
+            raise _Stopped("time limit")
+        if self._memory is not None and peak_memory() > self._memory:
+            raise _Stopped("memory limit")
+
+
+def peak_memory() -> float:
+    """The most memory this process has used, in MiB."""
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
+
+
+class _Engine:
+    """One clingo control that holds the axioms for a growing prefix of a trace."""
+
+    def __init__(self, trace: Trace, theory: Theory, watch: _Watch) -> None:
+        self.size = 0
+        self.ground_seconds = 0.0
+        self.solve_seconds = 0.0
+        self._trace = trace
+        self._theory = theory
+        self._watch = watch
+        self._control = clingo.Control(["--warn=none"])
+        for name in facts.encoding_names(theory):
+            self._control.load(encodings.path(name))
+        self._control.add("base", [], facts.theory_facts(theory))
+
+    def counts(self, cost: Cost) -> tuple[int, ...]:
+        """The counts that the theory minimises, in its order of preference."""
+        return tuple(getattr(cost, count) for count in self._theory.priorities)
+
+    def grow(self, size: int) -> None:
+        """Let the prefix have `size` steps."""
+        began = time.perf_counter()
+        control, old = self._control, self.size
+        try:
+            if old == 0:
+                control.ground([("base", [])])
+            while self.size < size:
+                self._watch.check()
+                part = f"steps_from_{self.size}"
+                stop = min(size, self.size + (8 if self.size < 32 else 1))
+                control.add(part, [], facts.trace_facts(self._trace, self._theory, self.size, stop))
+                control.ground([(part, []), *(("step", facts.step_number(t)) for t in range(self.size, stop))])
+                self.size = stop
+            if self.size > old:
+                control.ground([("check", facts.step_number(size - 1))])
+                if old:
+                    control.release_external(facts.query(old - 1))
+                control.assign_external(facts.query(size - 1), True)
+        finally:
+            self.ground_seconds += time.perf_counter() - began
+
+    def improving_maps(self) -> Iterator[SSHMap]:
+        """Maps of the prefix, each better than the one before; where the iteration ends, the last one is minimal."""
+        return self._solve("opt" if self._theory.priorities else "ignore", 0 if self._theory.priorities else 1)
+
+    def maps_of_cost(self, cost: Cost) -> Iterator[SSHMap]:
+        """All maps of the prefix that cost this and no more."""
+        bound = ",".join(str(count) for count in self.counts(cost))
+        return self._solve(f"enum,{bound}" if bound else "ignore", 0)
+
+    def _solve(self, mode: str, models: int) -> Iterator[SSHMap]:
+        configuration: Any = self._control.configuration.solve
+        configuration.opt_mode = mode
+        configuration.models = models
+        configuration.project = "project" if mode != "opt" else "no"
+        began = time.perf_counter()
+        with self._control.solve(yield_=True, async_=True) as handle:
+            try:
+                while True:
+                    handle.resume()
+                    while not handle.wait(POLL):
+                        self._watch.check()
+                    self._watch.check()
+                    model = handle.model()
+                    if model is None:
+                        if handle.get().interrupted:
+                            raise _Stopped("interrupted")
+                        break
+                    ssh_map = facts.read_map(model, self._trace, self._theory)
+                    self.solve_seconds += time.perf_counter() - began
+                    yield ssh_map
+                    began = time.perf_counter()
+            finally:
+                handle.cancel()
+                self.solve_seconds += max(0.0, time.perf_counter() - began)

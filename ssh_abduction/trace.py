@@ -1,0 +1,421 @@
+"""What a robot saw and did: the one type that crosses every border of the package.
+
+>>> from ssh_abduction import Trace
+>>> trace = Trace.from_steps(views=["a", "b", "a"], actions=["travel", "around"])
+>>> len(trace), trace.views, [a.kind for a in trace.actions]
+(3, ('a', 'b', 'a'), ['travel', 'turn'])
+
+A file holds JSON lines: a header, then a line a step with what was seen and the action taken next. See docs/formats.md.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, Literal, TypeAlias
+
+from ssh_abduction.errors import TraceError, brief
+
+View: TypeAlias = str | int
+Kind: TypeAlias = Literal["travel", "turn"]
+TurnDirection: TypeAlias = Literal["right", "left", "around"]
+Openings: TypeAlias = tuple[bool, bool, bool, bool]
+
+FORMAT, VERSION = "ssh-trace", 1
+LONGEST_LINE = 16 * 2**20  # bytes: a line with a panorama of 100,000 numbers fits, a file without line ends does not
+_KINDS = ("travel", "turn")
+_TURNS = ("right", "left", "around")
+_STEP_FIELDS = ("view", "image", "action", "star", "displacement", "truth")
+_ACTION_FIELDS = ("name", "kind", "turn")
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """A sequence of control laws that takes the robot from one distinctive state to another.
+
+    `kind` and `turn` are what the topological axioms ask for; the causal ones ask for the name alone.
+    """
+
+    name: str
+    kind: Kind | None = None
+    turn: TurnDirection | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+
+    @staticmethod
+    def of(value: Action | str | Mapping[str, Any]) -> Action:
+        """An action from its name, or from an object with `name`, `kind` and `turn`. Raises TraceError."""
+        if isinstance(value, Action):
+            return value
+        return _action(value, "action")
+
+    def to_json(self) -> Any:
+        if self == STANDARD_ACTIONS.get(self.name, Action(self.name)) and not self.extra:
+            return self.name
+        known = {"name": self.name, "kind": self.kind, "turn": self.turn}
+        return {**{k: v for k, v in known.items() if v is not None}, **self.extra}
+
+
+STANDARD_ACTIONS: dict[str, Action] = {
+    "travel": Action("travel", "travel"),
+    "right": Action("right", "turn", "right"),
+    "left": Action("left", "turn", "left"),
+    "around": Action("around", "turn", "around"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What was seen at one moment, and the action taken next (None at the end of the trace).
+
+    view          name or number of the view; None while only an image is there
+    star          the openings ahead, right, back and left as four 0/1, or their bearings in degrees, clockwise from ahead
+    displacement  (dx, dy, dtheta) from the last step, in metres and radians, robot frame
+    image         ranges in metres, or an index into the header's sidecar file
+    truth         for evaluation only; nothing that infers reads it
+    """
+
+    view: View | None = None
+    action: Action | None = None
+    star: tuple[float, ...] | None = None
+    displacement: tuple[float, float, float] | None = None
+    image: tuple[float, ...] | int | None = None
+    truth: Any = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def openings(self) -> Openings | None:
+        """The star as (ahead, right, back, left). Bearings go to the nearest quarter; TraceError where two share one."""
+        star = self.star
+        if star is None:
+            return None
+        if _is_quarters(star):
+            return bool(star[0]), bool(star[1]), bool(star[2]), bool(star[3])
+        slots = [math.floor(bearing / 90 + 0.5) % 4 for bearing in star]
+        if len(set(slots)) < len(slots):
+            raise TraceError(
+                f"star: expected bearings that fall into different quarters (ahead, right, back, left), "
+                f"got {brief(list(star))}; merge the openings that share a quarter"
+            )
+        ahead, right, back, left = (k in slots for k in range(4))
+        return ahead, right, back, left
+
+    def to_json(self) -> dict[str, Any]:
+        known: dict[str, Any] = {
+            "view": self.view,
+            "image": list(self.image) if isinstance(self.image, tuple) else self.image,
+            "action": self.action.to_json() if self.action else None,
+            "star": list(self.star) if self.star is not None else None,
+            "displacement": list(self.displacement) if self.displacement is not None else None,
+            "truth": self.truth,
+        }
+        return {**{k: v for k, v in known.items() if v is not None}, **self.extra}
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A sequence of steps: n + 1 observations with n actions between them. Immutable; made by `load` or `from_steps`."""
+
+    steps: tuple[Step, ...]
+    name: str | None = None
+    images: str | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    source: str | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        if not self.steps:
+            raise TraceError(f"{self.source or 'trace'}: expected at least one step, got none; add what the robot saw first")
+        last = len(self.steps) - 1
+        types: dict[str, tuple[int, Action]] = {}
+        for i, step in enumerate(self.steps):
+            action = step.action
+            if action is None:
+                if i < last:
+                    raise TraceError(f"{self.at(i)}: action: expected one, as another step follows; name the action that led to it")
+                continue
+            if i == last:
+                raise TraceError(
+                    f"{self.at(i)}: action: expected none on the last step, got {brief(action.name)}; "
+                    f"remove it, or add the step that it led to"
+                )
+            first, known = types.setdefault(action.name, (i, action))
+            if known != action:
+                raise TraceError(
+                    f"{self.at(i)}: action: {brief(action.name)} has kind {action.kind}, turn {action.turn} here but "
+                    f"kind {known.kind}, turn {known.turn} on {self.at(first)}; give the two different names, or the same kind"
+                )
+
+    def __len__(self) -> int:
+        """Number of steps: one more than there are actions."""
+        return len(self.steps)
+
+    def __iter__(self) -> Iterator[Step]:
+        return iter(self.steps)
+
+    @property
+    def views(self) -> tuple[View | None, ...]:
+        return tuple(step.view for step in self.steps)
+
+    @property
+    def actions(self) -> tuple[Action, ...]:
+        return tuple(step.action for step in self.steps if step.action is not None)
+
+    @property
+    def has_stars(self) -> bool:
+        """Whether any step carries a star."""
+        return any(step.star is not None for step in self.steps)
+
+    def at(self, step: int) -> str:
+        """Where a step is, as an error message says it: file and line, or the number of the step."""
+        return f"{self.source}:{step + 2}" if self.source else f"step {step}"
+
+    @classmethod
+    def from_steps(
+        cls,
+        views: Iterable[View],
+        actions: Iterable[Action | str | Mapping[str, Any]],
+        *,
+        stars: Iterable[Sequence[float] | None] | None = None,
+        name: str | None = None,
+    ) -> Trace:
+        """A trace from n + 1 views, the n actions between them, and n + 1 stars if there are any. Raises TraceError."""
+        seen, done = list(views), [Action.of(a) for a in actions]
+        if len(seen) != len(done) + 1:
+            raise TraceError(
+                f"trace: expected one view more than actions, got {len(seen)} views and {len(done)} actions; "
+                f"each action leads from one view to the next"
+            )
+        openings = [None] * len(seen) if stars is None else list(stars)
+        if len(openings) != len(seen):
+            raise TraceError(f"trace: expected a star a view, got {len(openings)} stars and {len(seen)} views")
+        steps = tuple(
+            Step(
+                view=_view(view, f"step {i}: view"),
+                action=done[i] if i < len(done) else None,
+                star=None if openings[i] is None else _star(list(openings[i] or ()), f"step {i}: star"),
+            )
+            for i, view in enumerate(seen)
+        )
+        return cls(steps, name=name)
+
+    def prefix(self, steps: int) -> Trace:
+        """The first `steps` steps of this trace."""
+        from dataclasses import replace
+
+        head = self.steps[:steps]
+        if head:
+            head = (*head[:-1], replace(head[-1], action=None))
+        return replace(self, steps=head)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Trace:
+        """The trace in a JSON Lines file, or on standard input for "-". Raises TraceError with file, line and field."""
+        source = "standard input" if str(path) == "-" else str(path)
+        try:
+            if str(path) == "-":
+                return _parse(sys.stdin.buffer, source)
+            with Path(path).open("rb") as file:
+                return _parse(file, source)
+        except OSError as error:
+            raise TraceError(f"{source}: expected a readable trace file: {error.strerror or error}; check the path") from None
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the trace as JSON Lines. The file appears whole or not at all. Raises TraceError."""
+        target = Path(path)
+        draft = target.with_name(f".{target.name}.{os.getpid()}.part")
+        try:
+            with draft.open("w", encoding="utf-8") as file:
+                file.writelines(line + "\n" for line in self.to_lines())
+            draft.replace(target)
+        except OSError as error:
+            raise TraceError(f"{target}: cannot write the trace: {error.strerror or error}; check the folder") from None
+        finally:
+            draft.unlink(missing_ok=True)
+
+    def to_lines(self) -> Iterator[str]:
+        """The lines of the trace's file: the header, then a line a step."""
+        header = {"format": FORMAT, "version": VERSION, "name": self.name, "images": self.images}
+        yield _dump({**{k: v for k, v in header.items() if v is not None}, **self.extra})
+        for step in self.steps:
+            yield _dump(step.to_json())
+
+
+def _dump(value: Mapping[str, Any]) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def _parse(file: BinaryIO, source: str) -> Trace:
+    header: dict[str, Any] | None = None
+    steps: list[Step] = []
+    actions: dict[str, Action] = {}
+    empty_line = 0
+    number = 0
+    while raw := file.readline(LONGEST_LINE + 1):
+        number += 1
+        where = f"{source}:{number}"
+        if len(raw) > LONGEST_LINE:
+            raise TraceError(
+                f"{where}: line: expected at most {LONGEST_LINE // 2**20} MiB, got more; write one step a line, and big images to a sidecar file"
+            )
+        if not raw.strip():
+            empty_line = empty_line or number
+            continue
+        if empty_line:
+            raise TraceError(f"{source}:{empty_line}: line: expected a step, got an empty line; remove it")
+        record = _record(raw, where)
+        if header is None:
+            header = _header(record, where)
+        else:
+            steps.append(_step(record, where, actions))
+    if header is None:
+        raise TraceError(
+            f'{source}:1: header: expected {{"format": "{FORMAT}", "version": {VERSION}}}, got an empty file; write the header, then a line a step'
+        )
+    if not steps:
+        raise TraceError(f"{source}:2: step: expected at least one after the header, got none; add what the robot saw first")
+    extra = {k: v for k, v in header.items() if k not in ("format", "version", "name", "images")}
+    return Trace(tuple(steps), name=header.get("name"), images=header.get("images"), extra=extra, source=source)
+
+
+def _record(raw: bytes, where: str) -> dict[str, Any]:
+    def constant(text: str) -> Any:
+        raise ValueError(f"{text} is not a number of JSON; replace it, or leave the field out")
+
+    def integer(text: str) -> int:
+        if len(text) > 100:
+            raise ValueError("a number of more than 100 digits; shorten it")
+        return int(text)
+
+    if b"\0" in raw:
+        raise TraceError(f"{where}: line: expected text in UTF-8, got a null byte at column {raw.index(0) + 1}; is this a binary file?")
+    try:
+        record = json.loads(
+            raw.rstrip().decode("utf-8-sig" if where.endswith(":1") else "utf-8"), parse_constant=constant, parse_int=integer
+        )
+    except UnicodeDecodeError as error:
+        raise TraceError(
+            f"{where}: line: expected text in UTF-8, got the byte 0x{raw[error.start]:02x} at column {error.start + 1}; is this a binary file?"
+        ) from None
+    except json.JSONDecodeError as error:
+        raise TraceError(
+            f"{where}: line: expected one JSON object, got broken JSON at column {error.colno} ({error.msg}); mend it there"
+        ) from None
+    except RecursionError:
+        raise TraceError(f"{where}: line: expected one JSON object, got one nested too deeply; flatten it") from None
+    except ValueError as error:
+        raise TraceError(f"{where}: line: expected one JSON object, got {error}") from None
+    if not isinstance(record, dict):
+        raise TraceError(f"{where}: line: expected a JSON object in braces, got {brief(record)}; write one step a line")
+    return record
+
+
+def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
+    if record.get("format") != FORMAT:
+        came = brief(record["format"]) if "format" in record else f"a line without it: {brief(dict(record))}"
+        raise TraceError(
+            f'{where}: format: expected "{FORMAT}" in a header, got {came}; put {{"format": "{FORMAT}", "version": {VERSION}}} on the first line'
+        )
+    version = record.get("version")
+    if version != VERSION or isinstance(version, bool):
+        raise TraceError(f"{where}: version: expected {VERSION}, got {brief(version)}; convert the file, or take a newer ssh-abduction")
+    for key in ("name", "images"):
+        if not isinstance(record.get(key), str | None):
+            raise TraceError(f"{where}: {key}: expected a text, got {brief(record[key])}; quote it or leave it out")
+    return dict(record)
+
+
+def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> Step:
+    view = _view(record["view"], f"{where}: view") if record.get("view") is not None else None
+    image = _image(record["image"], f"{where}: image") if record.get("image") is not None else None
+    if view is None and image is None:
+        raise TraceError(f"{where}: view: expected a text or an integer (or an image to make one from), got none; say what the robot saw")
+    action = None
+    if (raw := record.get("action")) is not None:
+        action = _action(raw, f"{where}: action")
+        if not action.extra:
+            action = actions.setdefault(action.name, action) if actions.get(action.name, action) == action else action
+    displacement = None
+    if (moved := record.get("displacement")) is not None:
+        numbers = _numbers(moved, f"{where}: displacement")
+        if len(numbers) != 3:
+            raise TraceError(f"{where}: displacement: expected [dx, dy, dtheta], got {brief(moved)}; give metres, metres, radians")
+        displacement = (numbers[0], numbers[1], numbers[2])
+    return Step(
+        view=view,
+        action=action,
+        star=_star(record["star"], f"{where}: star") if record.get("star") is not None else None,
+        displacement=displacement,
+        image=image,
+        truth=record.get("truth"),
+        extra={k: v for k, v in record.items() if k not in _STEP_FIELDS},
+    )
+
+
+def _view(value: Any, where: str) -> View:
+    if isinstance(value, bool) or not isinstance(value, str | int):
+        raise TraceError(f"{where}: expected a text or an integer, got {brief(value)}; name the view")
+    if isinstance(value, int) and not -(2**31) < value < 2**31:
+        raise TraceError(f"{where}: expected an integer of 32 bits, got {brief(value)}; write it as a text")
+    if isinstance(value, str) and "\0" in value:
+        raise TraceError(f"{where}: expected a text without null characters, got {brief(value)}; rename the view")
+    return value
+
+
+def _action(value: Any, where: str) -> Action:
+    if isinstance(value, str):
+        value = {"name": value}
+    if not isinstance(value, Mapping):
+        raise TraceError(f'{where}: expected a name or {{"name": …, "kind": …}}, got {brief(value)}; name the action')
+    name, kind, turn = (value.get(key) for key in _ACTION_FIELDS)
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise TraceError(f"{where}.name: expected a text, got {brief(name)}; name the action")
+    if kind is None and turn is None and name in STANDARD_ACTIONS:
+        kind, turn = STANDARD_ACTIONS[name].kind, STANDARD_ACTIONS[name].turn
+    if kind not in (None, *_KINDS):
+        raise TraceError(f'{where}.kind: expected "travel" or "turn", got {brief(kind)}; leave it out for other actions')
+    if kind == "turn" and turn is None and name in _TURNS:
+        turn = name
+    if turn not in (None, *_TURNS):
+        raise TraceError(f'{where}.turn: expected "right", "left" or "around", got {brief(turn)}; choose the nearest')
+    if turn is not None and kind != "turn":
+        raise TraceError(f'{where}.kind: expected "turn", as the action has a turn, got {brief(kind)}; set the kind or drop the turn')
+    if kind == "turn" and turn is None:
+        raise TraceError(f'{where}.turn: expected "right", "left" or "around" for a turn, got none; say which way it goes')
+    return Action(name, kind, turn, {k: v for k, v in value.items() if k not in _ACTION_FIELDS})
+
+
+def _numbers(value: Any, where: str) -> list[float]:
+    if not isinstance(value, list | tuple):
+        raise TraceError(f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]")
+    for i, x in enumerate(value):
+        if isinstance(x, bool) or not isinstance(x, int | float) or not math.isfinite(x):
+            raise TraceError(f"{where}[{i}]: expected a finite number, got {brief(x)}; replace it, or leave the field out")
+    return list(value)
+
+
+def _image(value: Any, where: str) -> tuple[float, ...] | int:
+    if isinstance(value, int) and not isinstance(value, bool):
+        if value < 0:
+            raise TraceError(f"{where}: expected an index of 0 or more into the sidecar file, got {value}; count from 0")
+        return value
+    return tuple(_numbers(value, where))
+
+
+def _star(value: Any, where: str) -> tuple[float, ...]:
+    if isinstance(value, list | tuple):
+        value = [int(x) if isinstance(x, bool) else x for x in value]
+    star = tuple(_numbers(value, where))
+    if not _is_quarters(star) and len({bearing % 360 for bearing in star}) < len(star):
+        raise TraceError(
+            f"{where}: expected four 0/1 (openings ahead, right, back, left) or different bearings in degrees, got {brief(list(star))}; mend it"
+        )
+    return star
+
+
+def _is_quarters(star: tuple[float, ...]) -> bool:
+    """Four 0/1 are openings: as bearings two of them would be equal."""
+    return len(star) == 4 and all(x in (0, 1) for x in star)

@@ -1,0 +1,381 @@
+"""Every map of a tiny trace (up to seven observations), by trying all of them: slow, plain, independent of encodings and checker.
+
+>>> from ssh_abduction import Theory, Trace
+>>> trace = Trace.from_steps("aaa", ["travel", "travel"])
+>>> counts, keys = minimal_maps(trace, Theory.topological())
+>>> counts
+Counts(dstates=3, paths=1, places=3, excuses=0)
+>>> keys
+{((0, 1, 2), (0, 1, 2), ((0, 1), (0, 1), (0, 1)))}
+
+A map is an equality of the steps, a place of every dstate, and a course (path and direction), or none, of every dstate. Orders, sides,
+headings and excused pairs of paths are witnesses: they have to exist, but do not tell two maps apart. A trace has to have views; a
+topological theory also needs the kinds of the actions. `one_place` and `one_course` always hold, even if the theory leaves them out.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from itertools import combinations, product
+from typing import NamedTuple, TypeAlias
+
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Action, Openings, Trace
+
+Labels: TypeAlias = tuple[int, ...]
+Places: TypeAlias = tuple[int | None, ...]
+Course: TypeAlias = tuple[int, int]
+Courses: TypeAlias = tuple[Course | None, ...]
+Key: TypeAlias = tuple[Labels, Places, Courses]
+Link: TypeAlias = tuple[int, Action, int]
+Order: TypeAlias = frozenset[tuple[int, int]]  # (p, q): p comes before q in direction +1
+Branch: TypeAlias = tuple[int, int, int, int, int]  # (p, h, d, h', d'): at p, (h', d') leaves to the right of (h, d)
+Axioms: TypeAlias = frozenset[str]
+
+SLOTS = (0, 1, 2, 3)
+QUARTERS = {"right": 1, "around": 2, "left": 3}
+
+
+class Counts(NamedTuple):
+    """What a theory may minimise."""
+
+    dstates: int
+    paths: int
+    places: int
+    excuses: int
+
+
+def key(ssh_map: SSHMap) -> Key:
+    """The map without its witnesses; dstates, places and paths numbered by the first step, where a path is faced in direction +1."""
+    by_id = {s.id: s for s in ssh_map.dstates}
+    visited = [by_id[s] for s in dict.fromkeys(ssh_map.labels)]
+    labels = {s.id: i for i, s in enumerate(visited)}
+    places: dict[int, int] = {}
+    paths: dict[int, Course] = {}
+    for s in visited:
+        if s.place is not None:
+            places.setdefault(s.place, len(places))
+        if s.path is not None and s.direction is not None:
+            paths.setdefault(s.path, (len(paths), s.direction))
+    return (
+        tuple(labels[s] for s in ssh_map.labels),
+        tuple(None if s.place is None else places[s.place] for s in visited),
+        tuple(None if s.path is None or s.direction is None else (paths[s.path][0], s.direction * paths[s.path][1]) for s in visited),
+    )
+
+
+def minimal_maps(trace: Trace, theory: Theory) -> tuple[Counts | None, set[Key]]:
+    """The counts and the keys of the consistent maps that come first by `theory.priorities`; (None, empty) where there is none.
+
+    The maps agree in the counts that the theory minimises. The other counts are those of one of them.
+    """
+    best: tuple[int, ...] | None = None
+    counts: Counts | None = None
+    keys: set[Key] = set()
+    for found, its_counts in consistent_maps(trace, theory):
+        cost = tuple(getattr(its_counts, name) for name in theory.priorities)
+        if best is None or cost < best:
+            best, counts, keys = cost, its_counts, set()
+        if cost == best:
+            keys.add(found)
+    return counts, keys
+
+
+def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]]:
+    """Every map that satisfies the axioms, once, with its counts: excuses are the fewest that make it consistent."""
+    theory = theory.resolve(trace)
+    on = frozenset(theory.axioms)
+    defeasible = theory.boundary == "defeasible"
+    stars = tuple(step.openings for step in trace)
+    for labels in _labellings(trace, on):
+        dstates = max(labels) + 1
+        if theory.level == "causal":
+            yield (labels, (None,) * dstates, (None,) * dstates), Counts(dstates, 0, 0, 0)
+            continue
+        links = frozenset(zip(labels, trace.actions, labels[1:], strict=False))
+        for places in _placings(labels, links, stars, on):
+            headings = list(_headings(labels, places, trace.actions, stars, on)) if theory.star == "frame" else []
+            if theory.star == "frame" and not headings:
+                continue
+            for courses in _courses(places, links, on):
+                if headings and not any(_goes_straight(labels, places, courses, h, on) for h in headings):
+                    continue
+                excuses = _least_excuses(places, courses, links, on, defeasible)
+                if excuses is not None:
+                    paths = len({course[0] for course in courses if course})
+                    yield (labels, places, courses), Counts(dstates, paths, len(set(places)), excuses)
+
+
+# --- dstates: which steps are equal
+
+
+def _labellings(trace: Trace, on: Axioms) -> Iterator[Labels]:
+    """The equalities of the steps: the dstate of each step, numbered by first visit."""
+    views, actions = trace.views, [a.name for a in trace.actions]
+
+    def allowed(labels: Labels) -> bool:
+        last = len(labels) - 1
+        for i in range(last):
+            # C1: a dstate has one view.
+            if "functional_view" in on and labels[i] == labels[last] and views[i] != views[last]:
+                return False
+            # C2: the same action done in the same dstate leads to the same dstate.
+            same_start = i > 0 and labels[i - 1] == labels[last - 1] and actions[i - 1] == actions[last - 1]
+            if "deterministic" in on and same_start and labels[i] != labels[last]:
+                return False
+        return True
+
+    def extend(labels: Labels) -> Iterator[Labels]:
+        if len(labels) == len(trace):
+            yield labels
+            return
+        for label in range(max(labels, default=-1) + 2):
+            if allowed((*labels, label)):
+                yield from extend((*labels, label))
+
+    return extend(())
+
+
+# --- places: which dstates are at the same place
+
+
+def _placings(labels: Labels, links: frozenset[Link], stars: tuple[Openings | None, ...], on: Axioms) -> Iterator[tuple[int, ...]]:
+    """The place of each dstate, numbered by first visit."""
+    dstates = max(labels) + 1
+
+    def allowed(places: tuple[int, ...]) -> bool:
+        for s, action, t in links:
+            if max(s, t) == len(places) - 1:
+                # T2: a turn stays.
+                if "turn_stays" in on and action.kind == "turn" and places[s] != places[t]:
+                    return False
+                # T3: a travel leaves.
+                if "travel_leaves" in on and action.kind == "travel" and places[s] == places[t]:
+                    return False
+        # Stars seen at a place are rotations of each other.
+        seen = {star for label, star in zip(labels, stars, strict=True) if star and label < len(places) and places[label] == places[-1]}
+        return "star_pattern" not in on or all(_rotated(a, b) for a, b in combinations(seen, 2))
+
+    def extend(places: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+        if len(places) == dstates:
+            yield places
+            return
+        for place in range(max(places, default=-1) + 2):
+            if allowed((*places, place)):
+                yield from extend((*places, place))
+
+    return extend(())
+
+
+def _rotated(a: Openings, b: Openings) -> bool:
+    return any(a[k:] + a[:k] == b for k in SLOTS)
+
+
+# --- headings: the slot of the place's frame that is faced at each step
+
+
+def _headings(
+    labels: Labels, places: tuple[int, ...], actions: tuple[Action, ...], stars: tuple[Openings | None, ...], on: Axioms
+) -> Iterator[tuple[int, ...]]:
+    """The headings that fit turns and stars. At the first step at a place it is 0: this chooses the place's frame."""
+    at = [places[label] for label in labels]
+
+    def slots(step: int, heading: int) -> set[int]:
+        """The open slots of the place, by the star of a step: opening j from ahead belongs to slot heading + j."""
+        star = stars[step]
+        assert star is not None
+        return {(heading + j) % 4 for j in SLOTS if star[j]}
+
+    def allowed(headings: tuple[int, ...]) -> bool:
+        last = len(headings) - 1
+        turn = actions[last - 1].turn if last else None
+        if "turn_rotates" in on and turn and headings[last] != (headings[last - 1] + QUARTERS[turn]) % 4:
+            return False
+        for i in range(last):
+            if "one_heading" in on and labels[i] == labels[last] and headings[i] != headings[last]:
+                return False
+            if at[i] != at[last]:
+                continue
+            if "one_dstate_per_heading" in on and headings[i] == headings[last] and labels[i] != labels[last]:
+                return False
+            if "star_frame" in on and slots(i, headings[i]) != slots(last, headings[last]):
+                return False
+        return True
+
+    def extend(headings: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+        if len(headings) == len(labels):
+            yield headings
+            return
+        for heading in SLOTS if at[len(headings)] in at[: len(headings)] else (0,):
+            if allowed((*headings, heading)):
+                yield from extend((*headings, heading))
+
+    return extend(())
+
+
+def _goes_straight(labels: Labels, places: tuple[int, ...], courses: Courses, headings: tuple[int, ...], on: Axioms) -> bool:
+    """A path leaves a place through opposite slots; a slot belongs to one path and direction, and these to one slot."""
+    if "path_goes_straight" not in on:
+        return True
+    through: dict[tuple[int, int], set[Course]] = defaultdict(set)
+    slots: dict[tuple[int, Course], set[int]] = defaultdict(set)
+    for label, heading in zip(labels, headings, strict=True):
+        if course := courses[label]:
+            path, direction = course
+            for slot, leaving in ((heading, (path, direction)), ((heading + 2) % 4, (path, -direction))):
+                through[places[label], slot].add(leaving)
+                slots[places[label], leaving].add(slot)
+    return all(len(x) == 1 for x in through.values()) and all(len(x) == 1 for x in slots.values())
+
+
+# --- courses: which dstates are along which path, and which way
+
+
+def _courses(places: tuple[int, ...], links: frozenset[Link], on: Axioms) -> Iterator[Courses]:
+    """The course of each dstate: None, or a path and a direction, numbered by first visit and +1 there."""
+    supported = _supported(links)
+
+    def allowed(courses: Courses) -> bool:
+        last = len(courses) - 1
+        course = courses[last]
+        # T5tot: every dstate is along a path.
+        if "all_on_paths" in on and course is None:
+            return False
+        # T5: a course comes from a travel.
+        if "course_needs_travel" in on and course is not None and last not in supported:
+            return False
+        # T8: one dstate for each place, path and direction.
+        if (
+            "one_dstate_per_course" in on
+            and course is not None
+            and (places[last], course) in zip(places[:last], courses[:last], strict=True)
+        ):
+            return False
+        return all(_link_allowed(courses[s], action, courses[t], on) for s, action, t in links if max(s, t) == last)
+
+    def extend(courses: Courses) -> Iterator[Courses]:
+        if len(courses) == len(places):
+            yield courses
+            return
+        paths = len({course[0] for course in courses if course})
+        for course in (None, *product(range(paths), (1, -1)), (paths, 1)):
+            if allowed((*courses, course)):
+                yield from extend((*courses, course))
+
+    return extend(())
+
+
+def _link_allowed(start: Course | None, action: Action, end: Course | None, on: Axioms) -> bool:
+    # T4: a travel follows one path in one direction.
+    if "travel_follows_path" in on and action.kind == "travel" and (start is None or start != end):
+        return False
+    # T6: a turn around keeps the path and reverses the direction.
+    reversed_end = None if end is None else (end[0], -end[1])
+    if "turn_around_reverses" in on and action.turn == "around" and start != reversed_end:
+        return False
+    # T7: a turn right or left changes the path, where both ends are along paths.
+    changes = action.turn in ("right", "left")
+    return not ("turn_changes_path" in on and changes and start is not None and end is not None and start[0] == end[0])
+
+
+def _supported(links: frozenset[Link]) -> set[int]:
+    """The dstates that a travel starts or ends at, and those that turns around join to them."""
+    found = {s for source, action, target in links if action.kind == "travel" for s in (source, target)}
+    around = [{source, target} for source, action, target in links if action.turn == "around"]
+    while more := {s for pair in around if pair & found for s in pair} - found:
+        found |= more
+    return found
+
+
+# --- orders and sides: whether there are witnesses
+
+
+def _least_excuses(places: tuple[int, ...], courses: Courses, links: frozenset[Link], on: Axioms, defeasible: bool) -> int | None:
+    """The fewest pairs of paths to be excused from B2, under any orders of the paths; None where no orders and excuses will do."""
+    paths = sorted({course[0] for course in courses if course})
+    on_path = {h: {p for p, c in zip(places, courses, strict=True) if c and c[0] == h} if "on_path" in on else set() for h in paths}
+    travels = [  # (p, q, h, d): a travel led from p to q along path h in direction d
+        (places[s], places[t], *course)
+        for s, action, t in links
+        if action.kind == "travel" and (course := courses[s]) and course == courses[t] and places[s] != places[t]
+    ]
+    branches = _branches(places, courses, links, on)
+    before: dict[int, set[tuple[int, int]]] = {h: set() for h in paths}
+    if "travel_orders" in on:
+        for p, q, h, d in travels:
+            before[h].add((p, q) if d == 1 else (q, p))
+    choices = []
+    for h in paths:
+        own = [travel for travel in travels if travel[2] == h]
+        choices.append([o for o in _orders(on_path[h], frozenset(before[h]), on) if "next_place" not in on or _goes_to_next(own, o)])
+    pairs = {frozenset((h, h1)) for _, h, _, h1, _ in branches} if defeasible and "side_of_branch" in on else set()
+    for excuses in range(len(pairs) + 1):
+        for orders in product(*choices):
+            for excused in combinations(pairs, excuses):
+                if _sides_allowed(branches, dict(zip(paths, orders, strict=True)), on_path, excused, on):
+                    return excuses
+    return None
+
+
+def _orders(places: set[int], before: Order, on: Axioms) -> Iterator[Order]:
+    """The least order that has `before` in it or, with path_order_total, every total one. Fewer pairs never break an axiom."""
+    if "order_transitive" in on:
+        while more := {(p, r) for p, q in before for q1, r in before if q == q1} - before:
+            before |= more
+    if "order_asymmetric" in on and any((q, p) in before for p, q in before):
+        return
+    if "path_order_total" in on:
+        for p, q in combinations(sorted(places), 2):
+            if (p, q) not in before and (q, p) not in before:
+                yield from _orders(places, before | {(p, q)}, on)
+                yield from _orders(places, before | {(q, p)}, on)
+                return
+    yield before
+
+
+def _goes_to_next(travels: list[tuple[int, int, int, int]], order: Order) -> bool:
+    """ADJ: no place lies strictly between the ends of a travel."""
+    for p, q, _, d in travels:
+        first, last = (p, q) if d == 1 else (q, p)
+        if any((first, r) in order and (r, last) in order for r in {place for pair in order for place in pair} - {p, q}):
+            return False
+    return True
+
+
+def _branches(places: tuple[int, ...], courses: Courses, links: frozenset[Link], on: Axioms) -> set[Branch]:
+    """B1: what leaves to the right of what."""
+    if "branch_side" not in on:
+        return set()
+    found: set[Branch] = set()
+    for s, action, t in links:
+        start, end = courses[s], courses[t]
+        if start is None or end is None or action.turn not in ("right", "left"):
+            continue
+        (h, d), (h1, d1) = start, end
+        branch = (places[s], h, d if action.turn == "right" else -d, h1, d1)
+        found.add(branch)
+        if "symmetric_sides" in on:
+            p, h, d, h1, d1 = branch
+            found |= {(p, h, -d, h1, -d1), (p, h1, d1, h, -d), (p, h1, -d1, h, d)}
+    return found
+
+
+def _sides_allowed(
+    branches: set[Branch], orders: dict[int, Order], on_path: dict[int, set[int]], excused: tuple[frozenset[int], ...], on: Axioms
+) -> bool:
+    right: set[tuple[int, int, int]] = set()  # (q, h, d): q lies to the right of (h, d)
+    for p, h, d, h1, d1 in branches:
+        # B2: the places ahead on a branch to the right lie to the right.
+        if "side_of_branch" in on and frozenset((h, h1)) not in excused:
+            ahead = {b for a, b in orders[h1] if a == p} if d1 == 1 else {a for a, b in orders[h1] if b == p}
+            right |= {(q, h, d) for q in ahead}
+    for q, h, d in right:
+        # B3: right and left are disjoint; left of (h, d) is right of (h, -d).
+        if "sides_disjoint" in on and (q, h, -d) in right:
+            return False
+        # B4: no place on a path lies to its right or left.
+        if "path_between_sides" in on and q in on_path[h]:
+            return False
+    return True

@@ -1,0 +1,93 @@
+"""Each axiom by itself: a trace on which leaving out just this axiom changes the answer."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+from worlds import ACTIONS
+
+from ssh_abduction import Theory, Trace, encodings, solve
+
+PLAIN = Theory.topological()
+NO_SIDES = PLAIN.replace(boundary="none")
+NEXT = NO_SIDES.replace(next_place=True)
+ON_PATHS = PLAIN.replace(all_on_paths=True)
+FRAME = PLAIN.replace(star="frame")
+NONE = None  # no map
+Answer = tuple[tuple[int, int, int] | None, int]
+
+# axiom: theory, trace, openings at each step, the counts and the number of minimal maps with the axiom, and without it
+CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
+    "functional_view": (PLAIN, "b L a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
+    "deterministic": (PLAIN, "a R a R b R a", "", ((3, 1, 0), 2), ((2, 1, 0), 1)),
+    "one_place": (PLAIN, "a T a", "", ((2, 2, 1), 1), ((1, 1, 1), 1)),
+    "turn_stays": (FRAME, "b L a", "right right+back", (NONE, 0), ((2, 2, 0), 1)),
+    "travel_leaves": (PLAIN, "a T a", "", ((2, 2, 1), 1), ((1, 1, 1), 1)),
+    "travel_follows_path": (PLAIN, "a T a", "", ((2, 2, 1), 1), ((2, 2, 0), 1)),
+    "one_course": (ON_PATHS, "a L a", "", ((2, 1, 2), 1), ((1, 1, 1), 1)),
+    "turn_around_reverses": (ON_PATHS, "c A c", "", ((2, 1, 1), 1), ((1, 1, 1), 1)),
+    "turn_changes_path": (ON_PATHS, "b L a", "", ((2, 1, 2), 1), ((2, 1, 1), 1)),
+    "one_dstate_per_course": (PLAIN, "a T b A c A d", "", (NONE, 0), ((4, 2, 1), 1)),
+    "on_path": (PLAIN, "a T b R b T a", "", ((4, 3, 2), 1), ((4, 2, 2), 1)),
+    "travel_orders": (PLAIN, "a T a T a", "", ((3, 3, 1), 1), ((2, 2, 1), 1)),
+    "order_asymmetric": (PLAIN, "a T a T a", "", ((3, 3, 1), 1), ((2, 2, 1), 1)),
+    "order_transitive": (PLAIN, "a T a T a T a", "", ((4, 4, 1), 1), ((3, 3, 1), 1)),
+    "path_order_total": (NEXT, "a T a A b T b A b", "", (NONE, 0), ((5, 3, 1), 1)),
+    "next_place": (NEXT, "b T a T b A b T b", "", ((5, 3, 1), 1), ((5, 3, 1), 2)),
+    "all_on_paths": (ON_PATHS, "b L a", "", ((2, 1, 2), 1), ((2, 1, 0), 1)),
+    "course_needs_travel": (PLAIN, "b T c R c L b", "", ((4, 2, 1), 1), ((4, 2, 1), 2)),
+    "branch_side": (ON_PATHS, "a T b R a L a", "", ((4, 2, 3), 1), ((4, 2, 2), 1)),
+    "symmetric_sides": (ON_PATHS, "a T b R a L a", "", ((4, 2, 3), 1), ((4, 2, 2), 1)),
+    "side_of_branch": (ON_PATHS, "a T b R a L a", "", ((4, 2, 3), 1), ((4, 2, 2), 1)),
+    "sides_disjoint": (ON_PATHS, "a T b R a L a", "", ((4, 2, 3), 1), ((4, 2, 2), 1)),
+    "path_between_sides": (PLAIN, "a T b R b T a", "", ((4, 3, 2), 1), ((4, 2, 2), 1)),
+    "star_pattern": (PLAIN.replace(star="pattern"), "b L a", "back right+back", (NONE, 0), ((2, 1, 0), 1)),
+    "star_frame": (FRAME, "b R a", "ahead+right ahead+right", (NONE, 0), ((2, 1, 0), 1)),
+    "one_heading": (FRAME, "c R c", "ahead left", ((2, 1, 0), 1), ((1, 1, 0), 1)),
+    "turn_rotates": (FRAME, "b L a", "ahead back", (NONE, 0), ((2, 1, 0), 1)),
+    "one_dstate_per_heading": (FRAME, "a R b L c", "ahead left ahead", (NONE, 0), ((3, 1, 0), 1)),
+    "path_goes_straight": (FRAME, "a T a A a T a", "back right left left", ((4, 3, 1), 1), ((4, 2, 1), 1)),
+}
+
+
+def trace_of(text: str, openings: str) -> Trace:
+    words = text.split()
+    sides = ("ahead", "right", "back", "left")
+    stars = [[side in seen.split("+") for side in sides] for seen in openings.split()] if openings else None
+    return Trace.from_steps(words[0::2], [ACTIONS[a] for a in words[1::2]], stars=stars)
+
+
+def answer(trace: Trace, theory: Theory) -> Answer:
+    solution = solve(trace, theory, maps=0)
+    assert solution.complete
+    cost = solution.cost
+    return (cost and (cost.dstates, cost.places, cost.paths)), solution.count
+
+
+def test_every_axiom_has_a_case() -> None:
+    assert set(CASES) == {axiom.name for axiom in encodings.axioms()}
+
+
+@pytest.mark.parametrize("axiom", CASES)
+def test_leaving_out_one_axiom_changes_the_answer(axiom: str) -> None:
+    theory, text, openings, with_it, without_it = CASES[axiom]
+    trace = trace_of(text, openings)
+    assert axiom in theory.axioms
+    assert answer(trace, theory) == with_it
+    assert answer(trace, theory.replace(without=(axiom,))) == without_it
+
+
+@pytest.mark.parametrize("axiom", encodings.axioms(), ids=lambda a: a.name)
+def test_an_axiom_has_a_sentence_and_a_source(axiom: Any) -> None:
+    assert re.fullmatch(r"[A-Z].*\.", axiom.sentence)
+    assert axiom.source
+
+
+@pytest.mark.parametrize("level", encodings.LEVELS)
+def test_every_violation_in_the_encodings_belongs_to_an_axiom(level: str) -> None:
+    text = (encodings.folder() / f"{level}.lp").read_text()
+    names = {axiom.name for axiom in encodings.axioms() if axiom.level == level}
+    assert set(re.findall(r"violation\((\w+),t\) :-", text)) - {"N"} == names
+    assert set(re.findall(r"% @axiom\((\w+)\)", text)) == names

@@ -1,0 +1,289 @@
+"""The command line: every verb, every exit code, and that no bad input shows a traceback."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import networkx as nx
+import pytest
+from worlds import TOURS, drive, rectangle
+
+from ssh_abduction import SSHMap, Theory, Trace, encodings, solve
+from ssh_abduction.cli import main
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+ACES = str(EXAMPLES / "aces3-route.jsonl")
+
+
+@pytest.fixture
+def solved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """The minimal maps of the ACES3 route, as solve --json prints them."""
+    assert main(["solve", ACES, "--json"]) == 0
+    path = tmp_path / "maps.json"
+    path.write_text(capsys.readouterr().out)
+    return path
+
+
+def saved(trace: Trace, folder: Path) -> str:
+    path = folder / "trace.jsonl"
+    trace.save(path)
+    return str(path)
+
+
+def test_solve_prints_the_maps_and_what_tells_them_apart(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["solve", ACES]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("optimal: 19 dstates, 10 places, 4 paths; 4 minimal maps;")
+    assert "what tells the maps apart\n" in out
+    assert "path 0: places" in out
+
+
+def test_json_is_the_contract(solved: Path) -> None:
+    data = json.loads(solved.read_text())
+    assert (data["status"], data["complete"], data["count"], data["steps"]) == ("optimal", True, 4, 23)
+    assert data["cost"] == {"dstates": 19, "places": 10, "paths": 4}
+    assert data["bound"] == {"dstates": 19}
+    assert data["theory"]["star"] == "frame"
+    assert set(data["seconds"]) == {"total", "ground", "solve"}
+    first = data["maps"][0]
+    assert len(first["labels"]) == 23
+    assert first["labels"][0] == 0
+    assert set(first["dstates"][0]) == {"id", "view", "place", "path", "direction", "heading"}
+    assert first["links"][0] == [0, "travel", 1]
+    assert first["places"] == list(range(10))
+    assert set(first["paths"][0]) == {"id", "order"}
+    assert [SSHMap.from_dict(m).to_dict() for m in data["maps"]] == data["maps"]
+
+
+def test_all_maps_and_a_few(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    route = saved(drive(*TOURS["comb"]), tmp_path)
+    flags = ["--boundary", "none", "--path-order", "partial", "--prefer", "paths,places,dstates", "--json"]
+    for n, count, complete in (("0", 308, True), ("5", 5, False), ("308", 308, True)):
+        assert main(["solve", route, "-n", n, *flags]) == 0
+        data = json.loads(capsys.readouterr().out)
+        assert (data["count"], len(data["maps"]), data["complete"]) == (count, count, complete)
+
+
+def test_every_field_of_a_theory_is_a_flag(capsys: pytest.CaptureFixture[str]) -> None:
+    flags = [
+        *("--theory", "circumscriptive", "--boundary", "defeasible", "--no-symmetric-sides", "--path-order", "partial", "--next-place"),
+        *("--no-all-on-paths", "--star", "pattern", "--prefer", "places,excuses", "--without", "on_path", "--level", "topological"),
+    ]
+    assert main(["solve", ACES, "-n", "1", "--json", *flags]) == 0
+    expected = Theory(
+        boundary="defeasible",
+        symmetric_sides=False,
+        path_order="partial",
+        next_place=True,
+        star="pattern",
+        prefer=("places", "excuses"),
+        without=("on_path",),
+    )
+    assert Theory.from_dict(json.loads(capsys.readouterr().out)["theory"]) == expected
+
+
+def test_an_impossible_trace_says_which_axioms_clash_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trace = Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"])
+    path = saved(Trace.from_steps("xyabcde", [*trace.actions, "travel"]), tmp_path)
+    assert main(["solve", path]) == 20
+    out = capsys.readouterr().out
+    assert out.startswith("unsatisfiable: no map satisfies the axioms: in steps 2 to 5 these clash: functional_view (step 5)")
+    assert "turn_around_reverses (steps 4, 5)" in out
+    assert main(["solve", path, "--json"]) == 20
+    data = json.loads(capsys.readouterr().out)
+    assert (data["status"], data["count"], data["cost"], data["complete"]) == ("unsatisfiable", 0, None, True)
+    assert data["explanation"]["first"] == 2
+    assert {"axiom": "functional_view", "steps": [5]} in data["explanation"]["clashes"]
+
+
+def test_nothing_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = saved(drive(*TOURS["comb"]), tmp_path)
+    assert main(["solve", path, "--time-limit", "1e-9"]) == 30
+    assert capsys.readouterr().out.startswith("unknown (time limit): no map of all 22 steps yet")
+    assert main(["solve", path, "--time-limit", "1e-9", "--json"]) == 30
+    assert json.loads(capsys.readouterr().out)["status"] == "unknown"
+
+
+def test_a_map_without_proof(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from test_solver import wandering
+
+    path = saved(wandering(3, rooms=12, length=80, views=2), tmp_path)
+    assert main(["solve", path, "--theory", "causal", "--time-limit", "3", "--json"]) == 10
+    data = json.loads(capsys.readouterr().out)
+    assert (data["status"], data["stopped"], data["count"], data["complete"]) == ("feasible", "time limit", 1, False)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+def test_ctrl_c_prints_what_is_known(tmp_path: Path) -> None:
+    path = saved(rectangle(40), tmp_path)
+    flags = ["--boundary", "none", "--path-order", "partial", "--prefer", "", "-n", "0", "--json"]
+    command = [sys.executable, "-m", "ssh_abduction", "solve", path, *flags]
+    with (
+        (tmp_path / "out.json").open("w") as out,
+        subprocess.Popen(command, stdout=out, stderr=subprocess.PIPE, text=True) as process,
+    ):
+        deadline = time.monotonic() + 60
+        while (tmp_path / "out.json").stat().st_size < 20_000 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+    data = json.loads((tmp_path / "out.json").read_text())
+    assert (data["stopped"], data["complete"], data["status"]) == ("interrupted", False, "optimal")
+    assert data["count"] == len(data["maps"]) > 0
+
+
+def test_check_accepts_what_solve_found(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", ACES, str(solved)]) == 0
+    assert capsys.readouterr().out == "4 of 4 maps satisfy the 27 axioms\n"
+
+
+def test_check_names_the_axiom_that_fails(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = json.loads(solved.read_text())
+    data["maps"][1]["dstates"][3]["place"] = 0
+    solved.write_text(json.dumps(data))
+    assert main(["check", ACES, str(solved)]) == 20
+    out = capsys.readouterr().out
+    assert re.search(r"^map 2: \w+: steps? ", out, re.MULTILINE)
+    assert out.endswith("3 of 4 maps satisfy the 27 axioms\n")
+
+
+def test_check_under_another_theory(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", ACES, str(solved), "--theory", "topological", "--next-place"]) == 20
+    assert "next_place" in capsys.readouterr().out
+
+
+def test_check_takes_one_saved_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trace = rectangle(8)
+    (ssh_map,) = solve(trace).maps
+    ssh_map.save(tmp_path / "map.json")
+    assert SSHMap.load(tmp_path / "map.json") == ssh_map
+    assert main(["check", saved(trace, tmp_path), str(tmp_path / "map.json")]) == 0
+    assert "1 of 1 maps satisfy the 21 axioms" in capsys.readouterr().out
+
+
+def test_show(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["show", str(solved)]) == 0
+    assert capsys.readouterr().out.count("path 0: places") == 4
+    assert main(["show", str(solved), "--map", "2"]) == 0
+    assert capsys.readouterr().out.count("path 0: places") == 1
+    assert main(["show", str(solved), "--dot"]) == 0
+    dot = capsys.readouterr().out
+    assert dot.startswith("digraph map {")
+    assert dot.count("subgraph cluster_") == 10
+    assert dot.count(" -> ") == len(json.loads(solved.read_text())["maps"][0]["links"])
+    assert main(["show", str(solved), "--graphml"]) == 0
+    graph = nx.parse_graphml(capsys.readouterr().out)
+    assert len(graph) == 19
+    assert main(["show", str(solved), "--svg"]) == 0
+    assert capsys.readouterr().out.startswith("<svg ")
+    assert main(["show", str(solved), "--map", "9"]) == 1
+    assert "--map: expected 1 to 4, got 9" in capsys.readouterr().err
+
+
+def test_facts_run_in_plain_clingo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["facts", ACES]) == 0
+    facts = capsys.readouterr().out
+    (tmp_path / "trace.lp").write_text(facts)
+    command = next(line for line in facts.splitlines() if "python run.py" in line).lstrip("% ")
+    words = [str(tmp_path / "trace.lp") if word == "THIS_FILE" else word for word in command.split()[1:]]
+    done = subprocess.run([sys.executable, *words], cwd=encodings.folder(), capture_output=True, text=True, check=False)
+    assert "OPTIMUM FOUND" in done.stdout
+    assert "Optimization : 19 4 10" in done.stdout
+    assert re.search(r"Optimal +: 4\n", done.stdout)
+
+
+def test_theory_lists_every_axiom(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["theory"]) == 0
+    out = capsys.readouterr().out
+    for axiom in encodings.axioms():
+        line = next(line for line in out.splitlines() if line.startswith(f"  {axiom.name} "))
+        assert axiom.sentence in line
+        assert axiom.source in line
+        assert ("on" in line.split()[2:3]) == (axiom.name in Theory.topological().axioms)
+
+
+BAD_INPUT = {
+    "empty file": b"",
+    "binary": bytes(range(256)),
+    "broken": b'{"format": "ssh-trace", "version": 1}\n{"view": }\n',
+    "no view anywhere": b'{"format": "ssh-trace", "version": 1}\n{"image": [1, 2]}\n',
+    "no kind": b'{"format": "ssh-trace", "version": 1}\n{"view": "a", "action": "jump"}\n{"view": "b"}\n',
+}
+
+
+@pytest.mark.parametrize("case", BAD_INPUT)
+@pytest.mark.parametrize("verb", ["solve", "facts"])
+def test_bad_input_is_one_line(verb: str, case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "t.jsonl"
+    path.write_bytes(BAD_INPUT[case])
+    assert main([verb, str(path)]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert re.fullmatch(rf"ssh-abduction: {re.escape(str(path))}:\d+: [^\n]+\n", captured.err)
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"maps": 3}', '{"labels": [0], "dstates": 3}', "{", '{"maps": [{}]}'])
+@pytest.mark.parametrize("verb", ["show", "check"])
+def test_bad_maps_are_one_line(verb: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "maps.json"
+    path.write_text(text)
+    assert main([verb, *([ACES] if verb == "check" else []), str(path)]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert re.fullmatch(rf"ssh-abduction: {re.escape(str(path))}[^\n]+\n", captured.err)
+
+
+def test_contradicting_choices_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["solve", ACES, "--theory", "causal", "--boundary", "strict"]) == 1
+    assert capsys.readouterr().err.startswith("ssh-abduction: boundary: expected none with level=causal")
+
+
+def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in ([], ["solve"], ["dance"], ["solve", ACES, "--boundary", "soft"]):
+        with pytest.raises(SystemExit) as stop:
+            main(words)
+        assert stop.value.code == 2
+    capsys.readouterr()
+
+
+def test_standard_input_and_a_reader_that_leaves(tmp_path: Path) -> None:
+    trace = Path(ACES).read_bytes()
+    command = [sys.executable, "-m", "ssh_abduction", "solve", "-"]
+    done = subprocess.run(command, input=trace, capture_output=True, check=True)
+    assert done.stdout.startswith(b"optimal: 19 dstates")
+    assert done.stderr == b""  # no progress where there is no terminal
+    pipe = subprocess.run(f"{sys.executable} -m ssh_abduction facts {ACES} | head -1", shell=True, capture_output=True, check=True)
+    assert pipe.stderr == b""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="terminals")
+def test_progress_shows_on_a_terminal(tmp_path: Path) -> None:
+    import pty
+
+    from test_solver import wandering
+
+    path = saved(wandering(3, rooms=12, length=80, views=2), tmp_path)
+    master, slave = pty.openpty()
+    command = [sys.executable, "-m", "ssh_abduction", "solve", path, "--theory", "causal", "--time-limit", "2.5"]
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "160"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=slave, env=environment) as process:
+        os.close(slave)
+        shown = b""
+        with contextlib.suppress(OSError):  # the terminal is gone when the program is
+            while chunk := os.read(master, 4096):
+                shown += chunk
+        assert process.wait(30) == 10
+    os.close(master)
+    text = shown.decode()
+    for part in ("prefix 8", "of 81 steps", "best", "dstates ≥", " s"):
+        assert part in text

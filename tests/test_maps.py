@@ -1,0 +1,121 @@
+"""Maps as values, as graphs, as files and as pictures."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from itertools import pairwise
+from pathlib import Path
+
+import networkx as nx
+import pytest
+from worlds import SQUARE, TEE, TOURS, Streets, drive, rectangle, streets, written
+
+from ssh_abduction import MapError, SSHMap, Theory, solve
+from ssh_abduction.picture import svg
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def the_map(tour: str, theory: Theory) -> SSHMap:
+    (ssh_map,) = solve(drive(*TOURS[tour], stars=theory.star != "none"), theory).maps
+    return ssh_map
+
+
+def test_the_map_of_a_tee_is_the_tee() -> None:
+    graph = the_map("tee", Theory.circumscriptive()).to_networkx("topological")
+    truth = nx.Graph([("W", "main"), ("J", "main"), ("E", "main"), ("J", "side"), ("S", "side")])
+    assert nx.is_isomorphic(graph, truth)
+    assert {data["bipartite"] for _, data in graph.nodes(data=True)} == {0, 1}
+
+
+def test_the_comb_is_found_with_stars_and_paths_first() -> None:
+    """The stand-in for Taylor Hall: 20 dstates, 7 places, 4 paths."""
+    graph = the_map("comb", Theory.circumscriptive()).to_networkx("topological")
+    truth = nx.Graph([(p, "main") for p in ("P1", "P2", "P3", "P4")])
+    truth.add_edges_from([("P1", "s1"), ("D1", "s1"), ("P2", "s2"), ("D2", "s2"), ("P4", "s4"), ("D3", "s4")])
+    assert nx.is_isomorphic(graph, truth)
+
+
+def test_the_causal_graph_has_an_edge_a_link() -> None:
+    ssh_map = the_map("comb", Theory.circumscriptive())
+    graph = ssh_map.to_networkx()
+    assert {(s, data["action"], x) for s, x, data in graph.edges(data=True)} == set(ssh_map.links)
+    assert graph.nodes[0]["view"] == ssh_map.dstates[0].view
+    assert nx.parse_graphml(ssh_map.to_graphml(), node_type=int, force_multigraph=True).number_of_edges() == len(ssh_map.links)
+    with pytest.raises(MapError, match="level: expected"):
+        ssh_map.to_networkx("metrical")  # type: ignore[arg-type]
+
+
+def test_maps_survive_files(tmp_path: Path) -> None:
+    for ssh_map in solve(drive(*TOURS["comb"]), Theory.topological()).maps:
+        ssh_map.save(tmp_path / "map.json")
+        loaded = SSHMap.load(tmp_path / "map.json")
+        assert loaded == ssh_map
+        assert loaded.to_dict() == ssh_map.to_dict()
+    with pytest.raises(MapError, match="cannot write the map"):
+        ssh_map.save(tmp_path / "no" / "map.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"labels": [9]}, "labels[0]: expected the id of a dstate, got 9"),
+        ({"labels": "no"}, "labels: expected a list"),
+        ({"links": [[0, "travel", 77]]}, "links[0]: expected [dstate, action name, dstate]"),
+        ({"places": []}, "places: expected every id that is used, got none for [0, 1]"),
+        ({"paths": [{"id": 3, "order": []}]}, "paths: expected every id that is used, got none for [0]"),
+        ({"dstates": [{"id": 1, "view": "a"}]}, "dstates: expected the ids 0, 1, 2"),
+        ({"dstates": [{"id": 0, "view": None}]}, "dstates[0].view: expected a text or an integer"),
+        ({"dstates": [{"id": 0, "view": "a", "path": 0}]}, "dstates[0].direction: expected 1 or -1 where there is a path"),
+    ],
+)
+def test_malformed_maps(change: dict[str, object], message: str) -> None:
+    (ssh_map,) = solve(written("a T b")).maps
+    with pytest.raises(MapError) as error:
+        SSHMap.from_dict({**ssh_map.to_dict(), **change}, "file")
+    assert str(error.value).startswith(f"file: {message}")
+
+
+def positions(picture: str) -> dict[str, tuple[float, float]]:
+    """Where the places are drawn, by the number in the circle."""
+    marks = list(ET.fromstring(picture))
+    found = {}
+    for circle, label in pairwise(marks):
+        if circle.tag == f"{SVG}circle":
+            found[str(label.text)] = (float(circle.attrib["cx"]), float(circle.attrib["cy"]))
+    return found
+
+
+@pytest.mark.parametrize("tour", ["comb", "tee", "plus", "two blocks, further"])
+def test_right_angled_worlds_are_drawn_at_right_angles(tour: str) -> None:
+    ssh_map = the_map(tour, Theory.circumscriptive().replace(star="frame"))
+    at = positions(svg(ssh_map))
+    assert len(set(at.values())) == len(ssh_map.places)
+    for path in ssh_map.paths:
+        xs, ys = zip(*(at[str(p)] for p in path.order), strict=True)
+        assert len(set(xs)) == 1 or len(set(ys)) == 1
+        assert list(xs) in (sorted(xs), sorted(xs, reverse=True))
+        assert list(ys) in (sorted(ys), sorted(ys, reverse=True))
+
+
+def test_turns_right_go_round_clockwise_on_the_page() -> None:
+    (ssh_map,) = solve(rectangle(16)).maps
+    at = positions(svg(ssh_map))
+    corners = [at[str(p)] for p in range(4)]
+    area = sum(ax * by - bx * ay for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True))
+    assert area > 0  # y grows downwards
+
+
+@pytest.mark.parametrize("world", [SQUARE, TEE, streets(("a", "E", "b"))])
+def test_every_map_can_be_drawn(world: Streets) -> None:
+    for theory in (Theory.causal(), Theory.topological(), Theory.topological().replace(boundary="none")):
+        for ssh_map in solve(drive(world, min(world), min(world[min(world)]), "TATA"), theory).maps:
+            ET.fromstring(svg(ssh_map))
+
+
+def test_strange_names_are_drawn_and_written_safely() -> None:
+    (ssh_map,) = solve(written('<a>&"\\ T <b>'), Theory.topological()).maps
+    ET.fromstring(svg(ssh_map))
+    assert '\\"' in ssh_map.to_dot()
+    (causal,) = solve(written("<a> T <b>"), Theory.causal()).maps
+    ET.fromstring(svg(causal))

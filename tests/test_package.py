@@ -1,0 +1,62 @@
+"""What is installed is what was tested: the wheel holds the encodings, and nothing shadows Python's own modules."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import ssh_abduction
+from ssh_abduction import encodings
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_the_wheel_holds_the_encodings_and_the_wings(tmp_path: Path) -> None:
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)], cwd=ROOT, check=True, capture_output=True
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    unpacked = tmp_path / "site"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(unpacked)
+    assert {p.name for p in (ROOT / "encodings").iterdir() if p.is_file()} == {
+        p.name for p in (unpacked / "ssh_abduction/encodings").iterdir()
+    }
+    assert (unpacked / "ssh_abduction/py.typed").exists()
+    assert {p.name for p in unpacked.iterdir() if not p.name.endswith(".dist-info")} == {"ssh_abduction", "perception", "simulator"}
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import ssh_abduction; from ssh_abduction import *; from ssh_abduction import encodings;"
+        "assert ssh_abduction.__file__.startswith(sys.argv[1]) and str(encodings.folder()).startswith(sys.argv[1]);"
+        "print(solve(Trace.from_steps('aba', ['travel', 'around'])).cost.dstates)"
+    )
+    done = subprocess.run([sys.executable, "-c", program, str(unpacked)], cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert done.stdout == "3\n"
+
+
+def test_the_top_level_folder_of_encodings_is_no_package() -> None:
+    assert not (ROOT / "encodings" / "__init__.py").exists()
+    assert encodings.folder().is_dir()
+
+
+def test_wings_export_nothing_at_the_top() -> None:
+    for wing in ("perception", "simulator"):
+        assert (ROOT / wing / "__init__.py").read_text() == ""
+
+
+def test_all_that_is_exported_exists() -> None:
+    for name in ssh_abduction.__all__:
+        assert getattr(ssh_abduction, name).__name__ == name
+
+
+def test_docstrings_run() -> None:
+    import doctest
+    import importlib
+
+    attempted = 0
+    for name in ("trace", "theory", "solver", "explain", "checker", "maps", "replay"):
+        result = doctest.testmod(importlib.import_module(f"ssh_abduction.{name}"))
+        assert result.failed == 0
+        attempted += result.attempted
+    assert attempted > 10

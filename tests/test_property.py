@@ -1,0 +1,75 @@
+"""On random tiny traces, under random theories, solver and checker agree with the brute force."""
+
+from __future__ import annotations
+
+from unittest.mock import patch
+
+import pytest
+from brute_force import consistent_maps, key, minimal_maps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import theories, traces
+
+from ssh_abduction import solve, solver
+from ssh_abduction.checker import check
+from ssh_abduction.theory import Count, Theory
+from ssh_abduction.trace import Trace
+
+LIMIT = 10  # seconds: a search that does not end is a failure, not a hang
+
+
+def agree(trace: Trace, theory: Theory) -> None:
+    """The solver lists each minimal map once, with its costs, and the checker accepts it."""
+    counts, expected = minimal_maps(trace, theory)
+    solution = solve(trace, theory, maps=0, limit=LIMIT)
+    assert solution.complete
+    listed = [key(ssh_map) for ssh_map in solution.maps]
+    assert len(listed) == len(set(listed))
+    assert set(listed) == expected
+    for ssh_map in solution.maps:
+        assert check(trace, ssh_map, theory) == ()
+    if counts is None:
+        assert solution.status is solver.Status.UNSATISFIABLE
+        assert solution.cost is None
+        return
+    assert solution.status is solver.Status.OPTIMAL
+    assert solution.cost is not None
+    for name in theory.priorities:
+        assert getattr(solution.cost, name) == getattr(counts, name)
+
+
+@settings(max_examples=2000, deadline=None, derandomize=True)
+@given(st.data())
+def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
+    trace = data.draw(traces(), label="trace")
+    theory = data.draw(theories(trace), label="theory")
+    # The traces are shorter than the solver's first prefix: a shorter one makes it replay and extend.
+    first_prefix = data.draw(st.sampled_from([1, 3, solver.FIRST_PREFIX]), label="first prefix")
+    with patch.object(solver, "FIRST_PREFIX", first_prefix):
+        agree(trace, theory)
+
+
+@pytest.mark.parametrize("prefer", [("places",), ("paths", "places"), ("excuses", "places"), ("places", "excuses")])
+def test_excuses_are_counted_where_no_pair_of_paths_can_be_excused(prefer: tuple[Count, ...]) -> None:
+    """The maps 0, 0 and 0, 1 are both minimal where dstates are not counted."""
+    trace = Trace.from_steps("aa", ["around"])
+    agree(trace, Theory(boundary="defeasible", star="none", prefer=prefer))
+
+
+@pytest.mark.parametrize("prefer", [(), ("excuses",)])
+def test_excuses_alone_are_minimised_where_no_pair_of_paths_can_be_excused(prefer: tuple[Count, ...]) -> None:
+    trace = Trace.from_steps("aaaaaaa", ["travel"] * 6)
+    agree(trace, Theory(boundary="defeasible", next_place=True, star="none", prefer=prefer))
+
+
+@settings(max_examples=500, deadline=None, derandomize=True)
+@given(st.data())
+def test_checker_rejects_what_the_brute_force_does_not_find(data: st.DataObject) -> None:
+    """The maps of one theory under the axioms of another. Where these allow the map, its witnesses may still have to change."""
+    trace = data.draw(traces(), label="trace")
+    theory = data.draw(theories(trace), label="theory of the maps")
+    other = data.draw(theories(trace), label="theory to check them by")
+    consistent = {found for found, _ in consistent_maps(trace, other)}
+    for ssh_map in solve(trace, theory, maps=50, limit=LIMIT).maps:
+        if key(ssh_map) not in consistent:
+            assert check(trace, ssh_map, other)

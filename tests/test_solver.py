@@ -1,0 +1,292 @@
+"""The search: prefixes and replay against solving at once, limits, streams, and scale."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import random
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given, settings
+from strategies import theories, traces
+from worlds import TOURS, drive, rectangle, written
+
+import ssh_abduction.solver as solver_module
+from ssh_abduction import Progress, Search, SolverError, SSHMap, Status, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction.checker import check
+from ssh_abduction.facts import links_of
+from ssh_abduction.replay import Log, Outcome
+
+THEORIES = {"causal": Theory.causal(), "topological": Theory.topological(), "circumscriptive": Theory.circumscriptive()}
+
+
+def wandering(seed: int, rooms: int, length: int, views: int) -> Trace:
+    """A random walk in a random Moore machine."""
+    choose = random.Random(seed)
+    exits = [[choose.randrange(rooms) for _ in "ab"] for _ in range(rooms)]
+    room, seen, done = 0, [], []
+    for _ in range(length):
+        seen.append(room % views)
+        done.append(choose.choice("ab"))
+        room = exits[room]["ab".index(done[-1])]
+    return Trace.from_steps([*seen, room % views], done)
+
+
+@pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
+@pytest.mark.parametrize("tour", TOURS)
+def test_prefixes_give_what_solving_at_once_gives(tour: str, theory: Theory) -> None:
+    world, place, heading, actions = TOURS[tour]
+    trace = drive(world, place, heading, actions, stars=theory.level == "topological")
+    by_prefix, at_once = solve(trace, theory, maps=0), solve(trace, theory, maps=0, prefixes=False)
+    assert set(by_prefix.maps) == set(at_once.maps)
+    assert (by_prefix.cost, by_prefix.bound, by_prefix.complete) == (at_once.cost, at_once.bound, True)
+    assert at_once.prefix == len(trace)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_prefixes_of_random_machines(seed: int) -> None:
+    trace = wandering(seed, rooms=4, length=40, views=3)
+    by_prefix, at_once = (solve(trace, Theory.causal(), maps=0, prefixes=p) for p in (True, False))
+    assert set(by_prefix.maps) == set(at_once.maps)
+    assert len(set(by_prefix.maps)) == by_prefix.count
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(traces(max_steps=9).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory))))
+def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
+    """Every prefix is tried, from the shortest, so that replay has all chances to go wrong."""
+    trace, theory = case
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solver_module, "FIRST_PREFIX", 1)
+        patch.setattr(solver_module, "GROWTH", 1.0)
+        by_prefix = solve(trace, theory, maps=0)
+    at_once = solve(trace, theory, maps=0, prefixes=False)
+    assert set(by_prefix.maps) == set(at_once.maps)
+    assert by_prefix.count == len(set(by_prefix.maps)) == at_once.count
+    assert by_prefix.status == at_once.status
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_streaming_lists_no_map_twice_and_misses_none(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With nothing held back, maps stream from a prefix that is too short for others."""
+    trace = wandering(seed, rooms=5, length=30, views=3)
+    at_once = solve(trace, Theory.causal(), maps=0, prefixes=False)
+    monkeypatch.setattr(solver_module, "FIRST_PREFIX", 2)
+    monkeypatch.setattr(solver_module, "HELD_BACK", 1)
+    streamed = solve(trace, Theory.causal(), maps=0)
+    assert streamed.count == len(set(streamed.maps))
+    assert set(streamed.maps) == set(at_once.maps)
+
+
+@pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
+def test_fifty_circuits_need_no_longer_prefix_than_two(theory: Theory) -> None:
+    two, fifty = solve(rectangle(16), theory), solve(rectangle(400), theory)
+    assert fifty.prefix == two.prefix < 16
+    assert fifty.cost == two.cost
+    assert len(fifty.maps[0].labels) == 401
+    assert check(rectangle(400), fifty.maps[0], theory) == ()
+
+
+@pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
+def test_five_thousand_circuits(theory: Theory) -> None:
+    trace = rectangle(40_000)
+    solution = solve(trace, theory)
+    assert solution.status is Status.OPTIMAL
+    assert solution.complete
+    assert solution.prefix < 16
+    assert check(trace, solution.maps[0], theory) == ()
+
+
+def test_a_surprise_after_many_circuits_is_not_missed() -> None:
+    """50 circuits and then another view: the closed map is wrong, and the surprise is in the answer."""
+    circuits = rectangle(48)
+    surprised = Trace.from_steps([*circuits.views[:-1], "surprise"], circuits.actions)  # type: ignore[list-item]
+    solution = solve(surprised, Theory.causal(), maps=0)
+    assert solution.prefix == len(surprised)
+    assert solution.status is Status.OPTIMAL
+    for ssh_map in solution.maps:
+        assert check(surprised, ssh_map, Theory.causal()) == ()
+    assert solution.cost is not None
+    assert solution.cost.dstates == 49  # a loop of four can end in nothing but v0, so nothing may be closed: 48 + the surprise
+
+
+def test_at_most_so_many_maps() -> None:
+    trace = drive(*TOURS["comb"])
+    theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
+    some, everything = solve(trace, theory, maps=5), solve(trace, theory, maps=0)
+    assert (some.count, some.complete, some.stopped, some.status) == (5, False, "maps limit", Status.OPTIMAL)
+    assert (everything.count, everything.complete, everything.stopped) == (308, True, None)
+    assert set(some.maps) <= set(everything.maps)
+    exactly = solve(trace, theory, maps=308)
+    assert (exactly.count, exactly.complete, exactly.stopped) == (308, True, None)
+
+
+def test_a_stream_of_millions_starts_at_once() -> None:
+    """One and a half circuits have 20,289 consistent maps without sides; three have far more than anyone waits for."""
+    theory = Theory(boundary="none", path_order="partial", prefer=())
+    search = Search(rectangle(24), theory, maps=0)
+    first = list(itertools.islice(search, 2000))
+    assert len(set(first)) == 2000
+    assert search.count == 2000
+
+
+def test_nothing_preferred_means_all_consistent_maps() -> None:
+    trace = written("a T a T a")
+    theory = Theory.causal().replace(prefer=())
+    assert solve(trace, theory).count == 4  # of the partitions of three steps, {0,1}{2} alone breaks determinism
+
+
+def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
+    trace = wandering(3, rooms=12, length=80, views=2)
+    solution = solve(trace, Theory.causal(), limit=3)
+    assert solution.stopped == "time limit"
+    assert solution.status is Status.FEASIBLE
+    assert solution.count == 1
+    assert not solution.complete
+    assert solution.cost is not None
+    assert solution.bound.dstates is not None
+    assert solution.bound.dstates <= solution.cost.dstates
+    assert check(trace, solution.maps[0], Theory.causal()) == ()
+    assert solution.seconds.total < 20
+
+
+def test_no_time_at_all_is_unknown_not_unsatisfiable() -> None:
+    solution = solve(drive(*TOURS["comb"]), limit=1e-9)
+    assert (solution.status, solution.stopped, solution.maps, solution.cost) == (Status.UNKNOWN, "time limit", (), None)
+
+
+def test_time_limit_while_listing_keeps_the_proof() -> None:
+    theory = Theory(boundary="none", path_order="partial", prefer=())
+    solution = solve(rectangle(24), theory, limit=1, maps=0)
+    assert (solution.status, solution.complete, solution.stopped) == (Status.OPTIMAL, False, "time limit")
+    assert solution.count > 0
+
+
+def test_memory_limit_stops_with_a_status() -> None:
+    solution = solve(drive(*TOURS["comb"]), memory=1)
+    assert (solution.status, solution.stopped) == (Status.UNKNOWN, "memory limit")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+def test_ctrl_c_leaves_the_best_map() -> None:
+    program = textwrap.dedent("""
+        import sys
+        sys.path.insert(0, sys.argv[1])
+        from test_solver import wandering
+        from ssh_abduction import Theory, solve
+        print("ready", flush=True)
+        solution = solve(wandering(3, rooms=9, length=150, views=2), Theory.causal())
+        print(solution.stopped, solution.status.value, solution.bound.dstates is not None)
+    """)
+    with subprocess.Popen([sys.executable, "-c", program, os.path.dirname(__file__)], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(2)
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.read().split()[0] == "interrupted"
+        assert process.wait(20) == 0
+
+
+def test_progress_is_reported() -> None:
+    reports: list[Progress] = []
+    solve(drive(*TOURS["comb"]), on_progress=reports.append)
+    prefixes = [r.prefix for r in reports]
+    bounds = [r.bound.dstates for r in reports if r.bound.dstates is not None]
+    assert prefixes == sorted(prefixes)
+    assert bounds == sorted(bounds)
+    assert reports[-1].maps == 2
+
+
+@pytest.mark.parametrize(("choices", "word"), [({"limit": 0}, "limit"), ({"maps": -1}, "maps"), ({"memory": 0}, "memory")])
+def test_limits_that_make_no_sense(choices: dict[str, int], word: str) -> None:
+    with pytest.raises(SolverError, match=f"^{word}: expected"):
+        solve(rectangle(4), **choices)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        ({"boundary": "soft"}, "boundary: expected one of none, strict, defeasible, got 'soft'"),
+        ({"prefer": ("dstates", "streets")}, "prefer: expected names out of dstates, paths, places, excuses, got 'streets'"),
+        ({"prefer": ("dstates", "dstates")}, "prefer: expected each name once"),
+        ({"prefer": ("excuses",)}, "prefer: expected no excuses with boundary=strict"),
+        ({"without": ("gravity",)}, "without: expected names out of"),
+        ({"level": "causal"}, "boundary: expected none with level=causal"),
+        ({"next_place": 1}, "next_place: expected true or false"),
+        ({"colour": "red"}, "theory: expected fields out of"),
+    ],
+)
+def test_theories_that_make_no_sense(choices: dict[str, object], message: str) -> None:
+    with pytest.raises(TheoryError) as error:
+        Theory.topological().replace(**choices)
+    assert str(error.value).startswith(message)
+
+
+def test_theories_survive_a_round_trip() -> None:
+    for theory in (*THEORIES.values(), Theory(boundary="defeasible", prefer=("paths", "excuses"), without=("on_path",))):
+        assert Theory.from_dict(theory.to_dict()) == theory
+
+
+def test_what_a_theory_asks_of_a_trace() -> None:
+    unkinded = Trace.from_steps(["a", "b"], ["jump"])
+    with pytest.raises(TraceError, match=r"step 0: action\.kind: expected"):
+        solve(unkinded)
+    assert solve(unkinded, Theory.causal()).cost is not None
+    with pytest.raises(TheoryError, match="star: expected a trace with stars"):
+        solve(rectangle(4), Theory(star="frame"))
+    some = Trace.from_steps(["a", "b"], ["travel"], stars=[(1, 0, 0, 0), None])
+    with pytest.raises(TraceError, match="step 1: star: expected one"):
+        solve(some)
+    assert solve(some, Theory(star="none")).cost is not None
+
+
+def maps_of_all_tours() -> Iterator[tuple[Trace, Theory, SSHMap]]:
+    for tour in TOURS:
+        for theory in THEORIES.values():
+            trace = drive(*TOURS[tour])
+            for ssh_map in solve(trace, theory).maps:
+                yield trace, theory, ssh_map
+
+
+def test_a_map_predicts_the_trace_it_was_made_for() -> None:
+    for trace, theory, ssh_map in maps_of_all_tours():
+        replayed = Log(trace, theory.resolve(trace)).replay(ssh_map.labels)
+        assert (replayed.labels, replayed.outcome) == (ssh_map.labels, Outcome.PREDICTED)
+        assert links_of(ssh_map.labels, trace) == ssh_map.links
+
+
+def test_replay_stops_where_the_map_knows_nothing_or_is_wrong() -> None:
+    trace = written("a T b A b T a T c")
+    log = Log(trace, Theory.causal())
+    assert log.replay((0, 1, 2)) == log.replay((0, 1, 2), known=3)
+    assert log.replay((0, 1, 2)).outcome is Outcome.UNKNOWN
+    assert log.replay((0, 1, 2, 0)).outcome is Outcome.CONTRADICTED  # a T leads to b, but c was seen
+
+
+# Symmetry: what a trace is called does not matter.
+
+
+def shape(ssh_map: SSHMap) -> tuple[object, ...]:
+    """A map without the names of views and actions."""
+    return ssh_map.labels, tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory))))
+def test_renaming_and_mirroring_leave_the_maps_alone(case: tuple[Trace, Theory]) -> None:
+    trace, theory = case
+    shapes = {shape(m) for m in solve(trace, theory, maps=0).maps}
+    stars = [step.star for step in trace.steps] if trace.has_stars else None
+    views = [f"seen {v}" for v in trace.views]
+    renamed = [{"name": f"do {a.name}", "kind": a.kind, "turn": a.turn} for a in trace.actions]
+    assert {shape(m) for m in solve(Trace.from_steps(views, renamed, stars=stars), theory, maps=0).maps} == shapes
+    flip = {"right": "left", "left": "right", "around": "around", None: None}
+    mirrored = [{"name": a.name, "kind": a.kind, "turn": flip[a.turn]} for a in trace.actions]
+    turned = [None if s is None else (s[0], s[3], s[2], s[1]) for s in stars] if stars else None
+    assert {shape(m) for m in solve(Trace.from_steps(views, mirrored, stars=turned), theory, maps=0).maps} == shapes

@@ -1,0 +1,225 @@
+"""Traces: reading, writing, and every kind of malformed file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ssh_abduction import Action, Step, Trace, TraceError
+from ssh_abduction import trace as trace_module
+
+HEADER = '{"format": "ssh-trace", "version": 1}'
+STEP = '{"view": "a", "action": "travel"}'
+LAST = '{"view": "b"}'
+
+
+def written(folder: Path, *lines: str) -> Path:
+    path = folder / "trace.jsonl"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def test_a_trace_survives_a_round_trip(tmp_path: Path) -> None:
+    lines = [
+        '{"format": "ssh-trace", "version": 1, "name": "n", "images": "i.npz", "robot": {"wheels": 4}}',
+        '{"view": "ä", "image": [1.5, 2], "action": {"name": "go", "kind": "travel", "speed": 1}, "star": [0, 90.5], "battery": 0.5}',
+        '{"view": 7, "action": {"name": "spin", "kind": "turn", "turn": "left"}, "displacement": [1, 0, -0.5], "truth": {"place": "x"}}',
+        '{"view": "v", "action": "look", "image": 3}',
+        '{"image": 4, "note": null}',
+    ]
+    path = written(tmp_path, *lines)
+    trace = Trace.load(path)
+    assert [json.loads(line) for line in trace.to_lines()] == [json.loads(line) for line in lines]
+    copy = tmp_path / "copy.jsonl"
+    trace.save(copy)
+    assert Trace.load(copy) == trace
+    assert [p.name for p in tmp_path.iterdir()].count("copy.jsonl") == 1
+    assert len(list(tmp_path.iterdir())) == 2  # no draft is left behind
+
+
+def test_standard_actions_need_no_object() -> None:
+    trace = Trace.from_steps("abcde", ["travel", "right", "left", "around"])
+    assert [(a.kind, a.turn) for a in trace.actions] == [("travel", None), ("turn", "right"), ("turn", "left"), ("turn", "around")]
+    assert [step.to_json().get("action") for step in trace.steps] == ["travel", "right", "left", "around", None]
+
+
+def test_fields_may_come_in_any_order(tmp_path: Path) -> None:
+    there = Trace.load(written(tmp_path, HEADER, '{"view": "a", "star": [1, 0, 0, 0], "action": "travel"}', LAST))
+    back = Trace.load(
+        written(tmp_path, '{"version": 1, "format": "ssh-trace"}', '{"action": "travel", "star": [1, 0, 0, 0], "view": "a"}', LAST)
+    )
+    assert there == back
+
+
+@pytest.mark.parametrize(
+    ("star", "openings"),
+    [
+        ((1, 0, 0, 1), (True, False, False, True)),
+        ((0.0, 90.0), (True, True, False, False)),
+        ((-90.0, 170.0, 20.0), (True, False, True, True)),
+        ((), (False, False, False, False)),
+        (None, None),
+    ],
+)
+def test_openings(star: tuple[float, ...] | None, openings: tuple[bool, ...] | None) -> None:
+    assert Step(view="a", star=star).openings == openings
+
+
+def test_bearings_that_share_a_quarter() -> None:
+    with pytest.raises(TraceError, match="merge the openings"):
+        _ = Step(view="a", star=(0, 30)).openings
+
+
+BAD: dict[str, tuple[list[str], str]] = {
+    "no header": ([STEP, LAST], "1: format: expected"),
+    "wrong format": (['{"format": "csv", "version": 1}', LAST], "1: format: expected"),
+    "wrong version": (['{"format": "ssh-trace", "version": 2}', LAST], "1: version: expected 1, got 2"),
+    "no version": (['{"format": "ssh-trace"}', LAST], "1: version: expected 1, got None"),
+    "header of another type": (["[1, 2]", LAST], "1: line: expected a JSON object"),
+    "header alone": ([HEADER], "2: step: expected at least one"),
+    "name that is no text": (['{"format": "ssh-trace", "version": 1, "name": 3}', LAST], "1: name: expected a text"),
+    "NaN": ([HEADER, '{"view": "a", "displacement": [NaN, 0, 0]}'], "2: line: expected one JSON object, got NaN"),
+    "infinite range": ([HEADER, '{"image": [1, Infinity]}'], "2: line: expected one JSON object, got Infinity"),
+    "number that overflows": ([HEADER, '{"image": [1, 1e999]}'], "2: image[1]: expected a finite number"),
+    "number of a million digits": ([HEADER, '{"view": ' + "1" * 10**6 + "}"], "2: line: expected one JSON object, got a number"),
+    "no view": ([HEADER, '{"action": "travel"}', LAST], "2: view: expected"),
+    "null view": ([HEADER, '{"view": null}'], "2: view: expected"),
+    "view of another type": ([HEADER, '{"view": 1.5}'], "2: view: expected a text or an integer, got 1.5"),
+    "true as a view": ([HEADER, '{"view": true}'], "2: view: expected a text or an integer, got True"),
+    "view of 40 bits": ([HEADER, '{"view": 1000000000000}'], "2: view: expected an integer of 32 bits"),
+    "view with a null character": ([HEADER, '{"view": "a\\u0000"}'], "2: view: expected a text without null"),
+    "last step with an action": ([HEADER, STEP], "2: action: expected none on the last step"),
+    "missing action": ([HEADER, LAST, LAST], "2: action: expected one"),
+    "action of another type": ([HEADER, '{"view": "a", "action": 3}', LAST], "2: action: expected a name"),
+    "action without a name": ([HEADER, '{"view": "a", "action": {"kind": "travel"}}', LAST], "2: action.name: expected a text"),
+    "unknown kind": ([HEADER, '{"view": "a", "action": {"name": "j", "kind": "jump"}}', LAST], "2: action.kind: expected"),
+    "unknown turn": ([HEADER, '{"view": "a", "action": {"name": "u", "kind": "turn", "turn": "up"}}', LAST], "2: action.turn: expected"),
+    "turn without a side": ([HEADER, '{"view": "a", "action": {"name": "u", "kind": "turn"}}', LAST], "2: action.turn: expected"),
+    "travel with a turn": (
+        [HEADER, '{"view": "a", "action": {"name": "u", "kind": "travel", "turn": "left"}}', LAST],
+        "2: action.kind: expected",
+    ),
+    "one name, two kinds": (
+        [HEADER, '{"view": "a", "action": {"name": "go", "kind": "travel"}}', '{"view": "a", "action": "go"}', LAST],
+        "3: action: 'go' has kind None",
+    ),
+    "star of texts": ([HEADER, '{"view": "a", "star": ["n"]}'], "2: star[0]: expected a finite number"),
+    "star with equal bearings": ([HEADER, '{"view": "a", "star": [10, 370]}'], "2: star: expected four 0/1"),
+    "displacement of two": ([HEADER, '{"view": "a", "displacement": [1, 2]}'], "2: displacement: expected [dx, dy, dtheta]"),
+    "negative index": ([HEADER, '{"image": -1}'], "2: image: expected an index"),
+    "broken JSON": ([HEADER, STEP, '{"view": "b"'], "3: line: expected one JSON object, got broken JSON at column 13"),
+    "two objects on a line": ([HEADER, LAST + LAST], "2: line: expected one JSON object, got broken JSON"),
+    "empty line inside": ([HEADER, STEP, "", LAST], "3: line: expected a step, got an empty line"),
+    "a number on a line": ([HEADER, "5"], "2: line: expected a JSON object in braces, got 5"),
+    "nested too deeply": (
+        [HEADER, '{"view": "a", "x": ' + "[" * 10**5 + "]" * 10**5 + "}"],
+        "2: line: expected one JSON object, got one nested",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files_say_file_line_field_and_how_to_mend_it(case: str, tmp_path: Path) -> None:
+    lines, message = BAD[case]
+    path = written(tmp_path, *lines)
+    with pytest.raises(TraceError) as error:
+        Trace.load(path)
+    text = str(error.value)
+    assert text.startswith(f"{path}:{message}")
+    assert "\n" not in text
+    assert len(text) < len(str(path)) + 300
+    assert ";" in text or "(" in text  # how to mend it
+
+
+def test_broken_json_in_line_4711(tmp_path: Path) -> None:
+    path = written(tmp_path, HEADER, *[STEP] * 4709, '{"view": "a", "action": travel}', LAST)
+    with pytest.raises(TraceError, match=r"trace\.jsonl:4711: line: expected one JSON object, got broken JSON at column 25"):
+        Trace.load(path)
+
+
+def test_an_empty_file(tmp_path: Path) -> None:
+    (tmp_path / "t").write_bytes(b"")
+    with pytest.raises(TraceError, match=r"1: header: expected .* got an empty file"):
+        Trace.load(tmp_path / "t")
+
+
+def test_a_binary_file(tmp_path: Path) -> None:
+    (tmp_path / "t").write_bytes(bytes(range(256)) * 100)
+    with pytest.raises(TraceError, match="is this a binary file"):
+        Trace.load(tmp_path / "t")
+
+
+def test_a_folder_and_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(TraceError, match="Is a directory; check the path"):
+        Trace.load(tmp_path)
+    with pytest.raises(TraceError, match="No such file or directory; check the path"):
+        Trace.load(tmp_path / "nothing")
+
+
+def test_a_line_without_end_is_not_read_into_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sparse file of 1 GB stands for a line of that length."""
+    path = tmp_path / "t"
+    with path.open("wb") as file:
+        file.write(HEADER.encode() + b"\n")
+        file.truncate(2**30)
+    with pytest.raises(TraceError, match=":2: line: expected at most 16 MiB"):
+        Trace.load(path)
+    assert trace_module.LONGEST_LINE == 16 * 2**20
+
+
+def test_a_byte_order_mark_is_no_harm(tmp_path: Path) -> None:
+    path = tmp_path / "t"
+    path.write_text("\ufeff" + HEADER + "\r\n" + LAST + "\r\n\r\n", encoding="utf-8")
+    assert Trace.load(path).views == ("b",)
+
+
+def test_saving_to_nowhere(tmp_path: Path) -> None:
+    with pytest.raises(TraceError, match="cannot write the trace"):
+        Trace.from_steps(["a"], []).save(tmp_path / "no" / "t.jsonl")
+
+
+@pytest.mark.parametrize(
+    ("views", "actions", "message"),
+    [
+        (["a"], ["travel"], "expected one view more than actions, got 1 views and 1 actions"),
+        ([], [], "expected one view more than actions"),
+        ([1.5], [], "step 0: view: expected a text or an integer"),
+        (["a", "b"], [7], "action: expected a name"),
+    ],
+)
+def test_bad_steps(views: list[str], actions: list[str], message: str) -> None:
+    with pytest.raises(TraceError, match=message):
+        Trace.from_steps(views, actions)
+
+
+def test_a_prefix_ends_without_an_action() -> None:
+    trace = Trace.from_steps("abc", ["travel", "right"], name="n")
+    assert trace.prefix(2) == Trace.from_steps("ab", ["travel"], name="n")
+    assert trace.prefix(3) == trace
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(st.binary(max_size=200) | st.text(max_size=200).map(lambda text: f"{HEADER}\n{text}".encode()))
+def test_any_file_is_a_trace_or_a_clear_error(data: bytes) -> None:
+    import tempfile
+
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(data)
+        file.flush()
+        message = ""
+        try:
+            Trace.load(file.name)
+        except TraceError as error:
+            message = str(error)
+        assert not message or message.startswith(file.name)
+        assert "\n" not in message
+
+
+def test_an_action_prints_and_compares() -> None:
+    assert Action.of("travel") == Action("travel", "travel")
+    assert Action.of({"name": "left", "kind": "turn"}).turn == "left"
+    assert Action.of(Action("x")) == Action("x")
