@@ -130,7 +130,7 @@ class Solution:
     """The answer for one trace.
 
     maps       minimal maps (status optimal), or the best one found (feasible)
-    cost       the counts of these maps; None where there is none
+    cost       the counts of the first of these maps; None where there is none. All share the counts that the theory prefers
     bound      proven lower bounds on the counts of any map
     complete   no further minimal map exists
     theory     the theory, with star settled
@@ -295,7 +295,7 @@ class Search:
             self._raise_bound(minimal)
             replayed = self._log.replay(minimal.labels)
             if replayed.outcome is Outcome.PREDICTED:
-                self.best = replace(minimal, labels=replayed.labels)
+                self._keep(minimal, replayed.labels)
                 self.status = Status.OPTIMAL
                 self._cost = Cost.of(minimal)
                 return True
@@ -341,7 +341,11 @@ class Search:
         """Keep a map, not yet proven minimal, if it explains the whole trace and is better than the best so far."""
         replayed = self._log.replay(ssh_map.labels)
         if replayed.outcome is Outcome.PREDICTED and (self.best is None or self._rank(ssh_map) < self._rank(self.best)):
-            self.best = replace(ssh_map, labels=replayed.labels)
+            self._keep(ssh_map, replayed.labels)
+
+    def _keep(self, ssh_map: SSHMap, labels: tuple[int, ...]) -> None:
+        self.best = replace(ssh_map, labels=labels)
+        self._watch.use_reserve()
 
     def _rank(self, ssh_map: SSHMap) -> tuple[int, ...]:
         return self._engine.counts(Cost.of(ssh_map))
@@ -353,7 +357,8 @@ class Search:
 
     def _salvage(self) -> None:
         """In the last part of the time limit, look for any map of the whole trace."""
-        self._watch.start(last_part=True)
+        self._watch.use_reserve()
+        self._watch.start()
         with suppress(_Stopped, KeyboardInterrupt):
             self._engine.grow(len(self.trace))
             for ssh_map in self._engine.improving_maps():
@@ -384,10 +389,12 @@ class _Watch:
         self._spent = 0.0
         self.interrupted = False
 
-    def start(self, last_part: bool = False) -> None:
-        if last_part:
-            self._allowed = self._limit
+    def start(self) -> None:
         self._started = time.perf_counter()
+
+    def use_reserve(self) -> None:
+        """From now on the whole time limit may be used."""
+        self._allowed = self._limit
 
     def stop(self) -> None:
         self._spent, self._started = self.elapsed(), None

@@ -10,6 +10,8 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -267,6 +269,36 @@ def test_replay_stops_where_the_map_knows_nothing_or_is_wrong() -> None:
     assert log.replay((0, 1, 2)) == log.replay((0, 1, 2), known=3)
     assert log.replay((0, 1, 2)).outcome is Outcome.UNKNOWN
     assert log.replay((0, 1, 2, 0)).outcome is Outcome.CONTRADICTED  # a T leads to b, but c was seen
+
+
+def test_mutated_maps_fail_the_check() -> None:
+    """Two labels swapped, a link dropped, an order turned: each is a violation, whatever the map."""
+    mutants = 0
+    for trace, theory, ssh_map in maps_of_all_tours():
+        assert check(trace, ssh_map, theory) == ()
+        labels = list(ssh_map.labels)
+        i, j = next((i, j) for i in range(len(labels)) for j in range(i) if labels[i] != labels[j])
+        labels[i], labels[j] = labels[j], labels[i]
+        wrong = [replace(ssh_map, labels=tuple(labels)), replace(ssh_map, links=ssh_map.links[1:])]
+        for k, path in enumerate(ssh_map.paths):
+            if len(path.order) > 1:
+                turned = replace(path, order=path.order[::-1])
+                wrong.append(replace(ssh_map, paths=(*ssh_map.paths[:k], turned, *ssh_map.paths[k + 1 :])))
+        for mutant in wrong:
+            assert check(trace, mutant, theory)
+            mutants += 1
+    assert mutants > 50
+
+
+def test_nothing_that_infers_reads_the_truth() -> None:
+    route = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
+    truths = [step.truth for step in route.steps]
+    assert any(truths)
+    random.Random(0).shuffle(truths)
+    shuffled = replace(route, steps=tuple(replace(step, truth=truth) for step, truth in zip(route.steps, truths, strict=True)))
+    bare = replace(route, steps=tuple(replace(step, truth=None) for step in route.steps))
+    answers = [[m.to_dict() for m in solve(trace).maps] for trace in (route, shuffled, bare)]
+    assert answers[0] == answers[1] == answers[2]
 
 
 # Symmetry: what a trace is called does not matter.
