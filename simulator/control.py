@@ -1,0 +1,137 @@
+"""Control laws. Each sees laser images and commands motions, and never learns the true pose.
+
+Trajectory-following: along the midline between two walls, or at a fixed distance from one. Hill-climbing: to the fixed point
+that is half a corridor's width from the wall ahead or in the middle of a street to the side, between the walls or at that
+distance from one, with the heading along the walls. Where the image does not show one of these, it stays as it is.
+Source: Kuipers & Beeson 2002, section on distinctive states; Kuipers 2000, the control level of the hierarchy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.errors import SimulatorError
+from simulator.laser import Laser
+from simulator.robot import Robot
+from simulator.sight import Sight, sight
+from simulator.world import World
+
+Array = NDArray[np.float64]
+TURNS = {"left": math.pi / 2, "right": -math.pi / 2, "around": math.pi}
+STRIDE = 0.15  # metres between two images while travelling
+STILL = 9  # images whose median is taken at rest: noise shrinks, lost beams vanish
+CLOSE = 0.015  # metres, and
+STRAIGHT = math.radians(0.75)  # radians: hill-climbing ends here, as near as such a base can be steered
+ASIDE = 0.015  # metres off the line that are worth backing off and coming again
+TRIES = 12
+LONGEST_TRAVEL = 300.0  # metres
+
+
+@dataclass
+class Driver:
+    """A robot in a world, with its laser: what control laws may use. `on_travel` is called with the robot after each stride."""
+
+    world: World
+    robot: Robot
+    laser: Laser
+    rng: np.random.Generator
+    on_travel: Callable[[Driver], None] | None = None
+
+    def look(self, images: int = 1) -> Array:
+        """An image, (180,) metres; of several, the median beam by beam."""
+        scans = self.laser.scan(self.world, np.repeat([self.robot.pose], images, axis=0), self.rng)
+        return np.median(scans, axis=0) if images > 1 else scans[0]
+
+    def see(self, images: int = 1) -> Sight:
+        return sight(self.look(images), self.world.reach, self.laser.reach)
+
+    def go(self, forward: float, turn: float = 0.0) -> None:
+        """Move, and make sure that the robot is still where it can be."""
+        self.robot.move(forward, turn)
+        x, y, _ = self.robot.pose
+        left, bottom, right, top = self.world.bounds
+        if not (left < x < right and bottom < y < top):
+            raise SimulatorError(f"{self.world.name}: the robot left the world at ({x:.2f}, {y:.2f}); close the gap in the walls")
+        if forward and self.world.clearance(x, y) < self.robot.body.radius:
+            raise SimulatorError(
+                f"{self.world.name}: the robot hit a wall at ({x:.2f}, {y:.2f}); give it {self.robot.body.radius} m of room"
+            )
+
+
+def act(driver: Driver, action: str) -> None:
+    """Do an action of a route: its trajectory-following law, then hill-climbing to the dstate where it ends."""
+    if action == "travel":
+        travel(driver)
+        climb(driver)
+    else:
+        driver.go(0.0, TURNS[action])
+        climb(driver, turned=True)
+
+
+def travel(driver: Driver) -> None:
+    """Follow the midline or the wall until the robot is at the next distinctive place."""
+    reach = driver.world.reach
+    began = driver.robot.driven
+    while True:
+        seen = driver.see()
+        done = driver.robot.driven - began
+        to_go = seen.to_go(reach, streets=done > 1.6 * reach)
+        if to_go is not None and to_go < 0.02:
+            if done < 0.1:
+                x, y, _ = driver.robot.pose
+                raise SimulatorError(
+                    f"{driver.world.name}: travel at ({x:.2f}, {y:.2f}): expected a free way ahead, got a wall; change the route"
+                )
+            return
+        if done > LONGEST_TRAVEL:
+            raise SimulatorError(f"{driver.world.name}: travel: expected a distinctive place within {LONGEST_TRAVEL:.0f} m, got none")
+        stride = STRIDE if to_go is None else min(STRIDE, max(0.5 * to_go, 0.01))
+        driver.go(stride, _steer(seen, reach, stride))
+        if driver.on_travel is not None:
+            driver.on_travel(driver)
+
+
+def _steer(seen: Sight, reach: float, stride: float) -> float:
+    """Radians to turn on the next stride: towards the line, then along it."""
+    offset = seen.offset(reach)
+    wanted = 0.0 if offset is None else -math.atan(1.5 * float(np.clip(offset, -0.5, 0.5)))
+    return (wanted - seen.tilt) * min(1.0, abs(stride) / 0.12)
+
+
+def climb(driver: Driver, turned: bool = False) -> None:
+    """Hill-climb to the fixed point: along the way, across it, and in heading. After a turn, only what needs no manoeuvre."""
+    reach = driver.world.reach
+    for attempt in range(TRIES):
+        seen = driver.see(STILL)
+        to_go, offset = seen.to_go(reach), seen.offset(reach)
+        aside = abs(offset) if offset is not None else 0.0
+        if aside > ASIDE and to_go is not None and abs(to_go) < 0.1 and not turned and attempt < TRIES // 2:
+            _come_again(driver)
+            continue
+        if abs(seen.tilt) > STRAIGHT:
+            driver.go(0.0, -seen.tilt)
+        if to_go is not None and CLOSE < abs(to_go) < 0.5 * reach:
+            driver.go(to_go)
+        elif abs(seen.tilt) <= STRAIGHT:
+            return
+
+
+def _come_again(driver: Driver) -> None:
+    """Back off a little, and approach along the line."""
+    reach = driver.world.reach
+    back = 0.0
+    while back < 0.5 * reach:
+        driver.go(-0.1)
+        back += 0.1
+    while True:
+        seen = driver.see(3)
+        to_go = seen.to_go(reach)
+        if to_go is None or to_go < 0.01:
+            return
+        stride = min(0.08, max(0.5 * to_go, 0.01))
+        driver.go(stride, _steer(seen, reach, stride))

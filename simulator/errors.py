@@ -1,0 +1,7 @@
+"""Errors of the simulator."""
+
+from ssh_abduction.errors import SSHError
+
+
+class SimulatorError(SSHError):
+    """A world, a pose or a tour that cannot be simulated. The text says what was expected, what came, and how to mend it."""

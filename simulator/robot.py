@@ -1,0 +1,54 @@
+"""A unicycle: it drives forward and turns, neither exactly, and its odometry tells neither exactly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+Pose = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Body:
+    """How well a robot drives. Actuation errs by a share of the motion, and the heading wanders with the distance.
+
+    radius    metres; a wall nearer than this is a collision
+    slip      standard deviation of the motion done, as a share of the motion commanded
+    wander    standard deviation of the heading, radians for a metre driven
+    odometry  standard deviation of the motion reported, as a share of the motion done
+    """
+
+    radius: float = 0.2
+    slip: float = 0.05
+    wander: float = 0.02
+    odometry: float = 0.02
+
+
+class Robot:
+    """The true pose of a robot, which only the simulator knows, and the motion that its odometry has reported."""
+
+    def __init__(self, body: Body, pose: Pose, rng: np.random.Generator) -> None:
+        self.body = body
+        self.pose = pose
+        self.driven = 0.0  # metres, as odometry has it
+        self.odometry: Pose = (0.0, 0.0, 0.0)  # pose since the start, as odometry has it
+        self._rng = rng
+
+    def move(self, forward: float, turn: float) -> None:
+        """Command a motion: metres forward (negative: back), and radians of turn on the way."""
+        e = self._rng.normal(size=5)
+        body = self.body
+        forward_done = forward * (1 + body.slip * e[0])
+        turn_done = turn * (1 + body.slip * e[1]) + body.wander * abs(forward) * e[2]
+        self.pose = _moved(self.pose, forward_done, turn_done)
+        forward_told, turn_told = forward_done * (1 + body.odometry * e[3]), turn_done * (1 + body.odometry * e[4])
+        self.odometry = _moved(self.odometry, forward_told, turn_told)
+        self.driven += abs(forward_told)
+
+
+def _moved(pose: Pose, forward: float, turn: float) -> Pose:
+    x, y, heading = pose
+    middle = heading + turn / 2
+    return x + forward * math.cos(middle), y + forward * math.sin(middle), math.remainder(heading + turn, math.tau)

@@ -1,0 +1,143 @@
+"""What a robot makes of one laser image: how it stands to the walls around it. Nothing here knows the true pose.
+
+Walls are taken to meet at right angles. The image is turned until its walls lie along the axes; then the walls ahead and
+alongside, and the far walls of streets that open to the sides, are the lines that most of the image lies on.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.laser import BEARINGS
+
+Array = NDArray[np.float64]
+THICK = 0.05  # metres: points so near to each other across a wall are on one wall
+LONG = 0.4  # metres: what is shorter is no wall, but clutter or the end of one
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Where the walls are, in metres and radians; None where there is no such wall in reach of the laser.
+
+    tilt           heading of the robot against the axis of the walls, counter-clockwise
+    front          distance to the wall across the way ahead
+    left, right    distances to the walls alongside
+    left_street    how far ahead the far wall of a street to the left is; right_street the same to the right
+    """
+
+    tilt: float
+    front: float | None
+    left: float | None
+    right: float | None
+    left_street: float | None
+    right_street: float | None
+
+    def to_go(self, reach: float, streets: bool = True) -> float | None:
+        """Metres ahead to the point that is `reach` before the wall ahead, or in the middle of a street that opens to a side."""
+        marks = [self.front] if self.front is not None and self.front < 2.5 * reach else []
+        if streets:
+            marks += [x for x in (self.left_street, self.right_street) if x is not None and x < 2.5 * reach]
+        return None if not marks else min(marks) - reach
+
+    def offset(self, reach: float) -> float | None:
+        """Metres that the robot is left of the midline, or of the line `reach` from the one wall alongside."""
+        near = 1.5 * reach
+        left = self.left if self.left is not None and self.left < near else None
+        right = self.right if self.right is not None and self.right < near else None
+        if left is not None and right is not None:
+            return (right - left) / 2
+        if left is not None:
+            return reach - left
+        return None if right is None else right - reach
+
+
+def sight(image: Array, reach: float, farthest: float) -> Sight:
+    """Read an image, (180,) metres. `reach` is half the width of a corridor; ranges from `farthest` on are nothing seen."""
+    seen = image < farthest - 0.02
+    bearings, ranges = BEARINGS[seen], image[seen]
+    points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1)
+    if len(points) < 20:
+        return Sight(0.0, None, None, None, None, None)
+    axis = _axis(points)
+    points = _turned(points, -axis)
+    axis += _finer(points, reach)
+    points = _turned(np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1), -axis)
+    x, y = points[:, 0], points[:, 1]
+    across, along = _spacing(y), _spacing(x)
+    # An axis turned to the left of the robot is a robot turned to the right of the axis.
+    return Sight(
+        tilt=-axis,
+        front=_line(x, across, (x > 0.05) & (np.abs(y) < 0.5 * reach)),
+        left=_line(y, along, (y > 0.05) & (y < 2 * reach) & (np.abs(x) < 6 * reach)),
+        right=_line(-y, along, (y < -0.05) & (y > -2 * reach) & (np.abs(x) < 6 * reach)),
+        left_street=_line(x, across, (y > reach + 0.35) & (y < 5 * reach) & (x > -0.5 * reach)),
+        right_street=_line(x, across, (y < -reach - 0.35) & (y > -5 * reach) & (x > -0.5 * reach)),
+    )
+
+
+def _turned(points: Array, angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    turned: Array = points @ np.array([[c, s], [-s, c]])
+    return turned
+
+
+def _axis(points: Array) -> float:
+    """The direction of the walls, in -45 to 45 degrees: the mean direction, modulo a right angle, of chords between near points."""
+    chords = points[8:] - points[:-8]
+    length = np.hypot(chords[:, 0], chords[:, 1])
+    good = (length > 0.08) & (length < 1.5)
+    if not good.any():
+        return 0.0
+    directions, weights = np.arctan2(chords[good, 1], chords[good, 0]), length[good]
+    axis = float(np.angle((weights * np.exp(4j * directions)).sum())) / 4
+    for tolerance in (0.2, 0.1):
+        off = np.angle(np.exp(4j * (directions - axis))) / 4
+        close = np.abs(off) < tolerance
+        if close.sum() > 5:
+            axis += float(np.average(off[close], weights=weights[close]))
+    return axis
+
+
+def _finer(points: Array, reach: float) -> float:
+    """What is left of the angle between the walls and the axes: the slopes of the best lines, each as sure as it is long."""
+    slopes, weights = [], []
+    for u, v in ((0, 1), (1, 0)):
+        inside = np.abs(points[:, v]) < 3 * reach
+        for side in (1, -1):
+            chosen = inside & (side * points[:, v] > 0.05)
+            line = _line(points[:, v], _spacing(points[:, u]), chosen)
+            if line is None:
+                continue
+            on = chosen & (np.abs(points[:, v] - line) < THICK)
+            a, b = points[on, u], points[on, v]
+            spread = float(((a - a.mean()) ** 2).sum())
+            if on.sum() > 8 and spread > 0.2:
+                slope = float(((a - a.mean()) * (b - b.mean())).sum()) / spread
+                slopes.append(slope if v == 1 else -slope)
+                weights.append(spread)
+    return float(np.average(slopes, weights=weights)) if slopes else 0.0
+
+
+def _spacing(values: Array) -> Array:
+    """How much of a wall along this axis each point stands for."""
+    return np.minimum(np.abs(np.gradient(values)), 0.3)
+
+
+def _line(values: Array, weights: Array, chosen: NDArray[np.bool_]) -> float | None:
+    """The value that most of the chosen points share, by length of wall; None where no wall is long enough."""
+    picked, length = values[chosen], weights[chosen]
+    if len(picked) < 5:
+        return None
+    order = np.argsort(picked)
+    picked, length = picked[order], length[order]
+    total = np.concatenate([[0.0], np.cumsum(length)])
+    ends = np.searchsorted(picked, picked + THICK, side="right")
+    support = total[ends] - total[: len(picked)]
+    first = int(support.argmax())
+    if support[first] < LONG or ends[first] - first < 5:
+        return None
+    return float(np.average(picked[first : ends[first]], weights=length[first : ends[first]] + 1e-6))

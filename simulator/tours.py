@@ -1,0 +1,140 @@
+"""Tours: a robot drives a route again and again, and logs at each dstate the image that it sees and the action it takes next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.control import STILL, Driver, act, climb
+from simulator.errors import SimulatorError
+from simulator.laser import Laser
+from simulator.robot import Body, Robot
+from simulator.world import World
+from ssh_abduction.trace import Action, Step, Trace
+
+Array = NDArray[np.float64]
+QUARTERS = {"travel": 0, "right": 1, "around": 2, "left": 3}
+
+
+@dataclass
+class Star:
+    """The openings of the place where the robot is, slot by slot, as it has seen them since it came."""
+
+    reach: float
+    slots: dict[int, bool] = field(default_factory=dict)
+    facing: int = 0
+
+    def act(self, action: str) -> None:
+        if action == "travel":
+            self.slots, self.facing = {2: True}, 0  # it came from behind
+        else:
+            self.facing = (self.facing + QUARTERS[action]) % 4
+
+    def look(self, image: Array) -> None:
+        """Openings ahead, right and left are where the nearest wall is far. The half circle shows nothing behind."""
+        for slot, beams in ((0, image[82:98]), (1, image[:10]), (3, image[-10:])):
+            self.slots[(self.facing + slot) % 4] = bool(np.median(beams) > 1.8 * self.reach)
+
+    def seen(self) -> tuple[float, ...]:
+        return tuple(float(self.slots.get((self.facing + k) % 4, False)) for k in range(4))
+
+
+def simulate(
+    world: World,
+    tours: int = 1,
+    seed: int = 0,
+    *,
+    laser: Laser | None = None,
+    body: Body | None = None,
+    stars: bool = True,
+    every: float | None = None,
+) -> Trace:
+    """Drive `tours` tours, and log an image at each dstate: (tours x actions) steps, the last without its action.
+
+    stars   also log the openings at each place, as the robot saw them since it came there
+    every   log an image each so many metres of odometry instead, wherever the robot is; the trace then has travels only
+    The truth goes into `truth`: dstate, place, path and pose. Nothing but evaluation may read it.
+    Raises SimulatorError where the route cannot be driven.
+    """
+    if tours < 1:
+        raise SimulatorError(f"tours: expected 1 or more, got {tours}")
+    if not world.route:
+        raise SimulatorError(f"{world.name}: route: expected at least one action, got none; add it to the world, or give one")
+    body = body or Body()
+    x, y, _ = world.start
+    left, bottom, right, top = world.bounds
+    if not (left < x < right and bottom < y < top) or world.clearance(x, y) < body.radius:
+        raise SimulatorError(f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, {y}); move it")
+    rng = np.random.default_rng(seed)
+    robot = Robot(body, world.start, rng)
+    driver = Driver(world.arranged(rng), robot, laser or Laser(), rng)
+    logged = _evenly(driver, world, tours, every) if every else _at_dstates(driver, world, tours, stars)
+    steps = list(logged)
+    steps[-1] = Step(image=steps[-1].image, star=steps[-1].star, truth=steps[-1].truth)
+    return Trace(tuple(steps), name=f"{world.name}, {tours} tours, seed {seed}")
+
+
+def _at_dstates(driver: Driver, world: World, tours: int, stars: bool) -> Iterator[Step]:
+    star = Star(world.reach)
+    climb(driver)
+    if stars:  # look behind, as the half circle does not show it
+        driver.go(0.0, math.pi)
+        star.facing = 2
+        star.look(driver.look(STILL))
+        driver.go(0.0, math.pi)
+        star.facing = 0
+        climb(driver)
+    for tour in range(tours):
+        if tour:
+            driver.world = world.arranged(driver.rng)
+        for action in world.route:
+            image = driver.look(STILL)
+            star.look(image)
+            yield Step(
+                image=_metres(image),
+                action=Action.of(action),
+                star=star.seen() if stars else None,
+                truth=_truth(world, driver.robot.pose),
+            )
+            act(driver, action)
+            star.act(action)
+
+
+def _evenly(driver: Driver, world: World, tours: int, every: float) -> Iterator[Step]:
+    """Images each `every` metres of odometry. What is at most that far along the route counts as one spot, tour after tour."""
+    logged: list[Step] = []
+    leg_began = due = 0.0
+    leg = 0
+
+    def log(driver: Driver) -> None:
+        nonlocal due
+        if driver.robot.driven >= due:
+            spot = f"leg {leg % len(world.route)}, {round((driver.robot.driven - leg_began) / every)}"
+            truth = {"dstate": spot, "pose": [round(v, 4) for v in driver.robot.pose]}
+            logged.append(Step(image=_metres(driver.look(STILL)), action=Action.of("travel"), truth=truth))
+            due += every
+
+    driver.on_travel = log
+    climb(driver)
+    for tour in range(tours):
+        if tour:
+            driver.world = world.arranged(driver.rng)
+        for action in world.route:
+            leg_began = driver.robot.driven
+            act(driver, action)
+            leg += 1
+    yield from logged
+
+
+def _metres(image: Array) -> tuple[float, ...]:
+    return tuple(round(float(r), 4) for r in image)
+
+
+def _truth(world: World, pose: Sequence[float]) -> dict[str, object]:
+    found = world.nearest(pose)
+    where = {"pose": [round(float(v), 5) for v in pose]}
+    return {"dstate": found.name, "place": found.place, "path": found.path, "direction": found.direction, **where} if found else dict(where)

@@ -1,0 +1,371 @@
+"""The simulator: worlds, laser, robot, control laws, tours."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from simulator.control import Driver, act, climb
+from simulator.errors import SimulatorError
+from simulator.laser import BEARINGS, Laser
+from simulator.robot import Body, Robot
+from simulator.sight import sight
+from simulator.tours import simulate
+from simulator.world import World
+from ssh_abduction import Trace
+
+RECTANGLE = World.named("notched-rectangle")
+HALL = World.named("taylor-hall")
+ROOM: dict[str, Any] = {
+    "format": "ssh-world",
+    "version": 1,
+    "polygons": [[[0, 0], [4, 0], [4, 2], [0, 2]]],
+    "start": [3.4, 1.4, 0],
+    "reach": 0.6,
+    "route": ["right", "travel"] * 4,
+}
+
+
+def world_of(folder: Path, **changes: Any) -> World:
+    path = folder / "world.json"
+    path.write_text(json.dumps({**ROOM, **changes}))
+    return World.load(path)
+
+
+def poses_by_dstate(trace: Trace) -> dict[str, np.ndarray]:
+    found: dict[str, list[list[float]]] = {}
+    for step in trace.steps:
+        found.setdefault(step.truth["dstate"], []).append(step.truth["pose"])
+    return {name: np.array(poses) for name, poses in found.items()}
+
+
+@pytest.fixture(scope="module")
+def circuits() -> Trace:
+    return simulate(RECTANGLE, tours=50, seed=1000)
+
+
+@pytest.fixture(scope="module")
+def tours() -> Trace:
+    return simulate(HALL, tours=3, seed=1000)
+
+
+# Laser
+
+
+def by_hand(world: World, pose: tuple[float, float, float], bearing: float, reach: float) -> float:
+    """One beam, wall by wall, with the formula for two lines."""
+    x, y, heading = pose
+    dx, dy = math.cos(heading + bearing), math.sin(heading + bearing)
+    nearest = reach
+    for x1, y1, x2, y2 in world.segments:
+        ex, ey = x2 - x1, y2 - y1
+        across = dx * ey - dy * ex
+        if abs(across) < 1e-12:
+            continue
+        r = ((x1 - x) * ey - (y1 - y) * ex) / across
+        s = ((x1 - x) * dy - (y1 - y) * dx) / across
+        if r > 0 and 0 <= s <= 1:
+            nearest = min(nearest, r)
+    return nearest
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(st.floats(0.3, 3.7), st.floats(0.3, 1.7), st.floats(-4, 4))
+def test_ranges_are_those_computed_beam_by_beam(x: float, y: float, heading: float) -> None:
+    ranges = Laser().exact(RECTANGLE, np.array([[x, y, heading]]))[0]
+    expected = [by_hand(RECTANGLE, (x, y, heading), b, 8.0) for b in BEARINGS]
+    np.testing.assert_allclose(ranges, expected, atol=1e-9)
+
+
+def test_many_poses_at_once_are_the_same_as_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    poses = np.random.default_rng(0).uniform([0.3, 0.3, -3], [3.7, 1.7, 3], (50, 3))
+    together = Laser().exact(RECTANGLE, poses)
+    monkeypatch.setattr("simulator.laser._BLOCK", 180 * 8 * 7)
+    np.testing.assert_array_equal(Laser().exact(RECTANGLE, poses), together)
+    np.testing.assert_array_equal(np.vstack([Laser().exact(RECTANGLE, pose) for pose in poses]), together)
+
+
+def test_the_first_beam_is_at_the_right_and_the_last_at_the_left() -> None:
+    ranges = Laser().exact(RECTANGLE, np.array([[1.0, 0.5, 0.0]]))[0]
+    assert ranges[0] == pytest.approx(0.5, abs=0.01)
+    assert ranges[-1] == pytest.approx(1.5, abs=0.01)
+
+
+def test_noise_dropouts_and_reach() -> None:
+    laser, rng = Laser(noise=0.01, reach=3.0, dropouts=0.02), np.random.default_rng(0)
+    pose = np.array([[1.0, 1.0, 0.0]])
+    scans = laser.scan(RECTANGLE, np.repeat(pose, 2000, axis=0), rng)
+    exact = laser.exact(RECTANGLE, pose)[0]
+    near = exact < 2.5
+    assert scans.max() == 3.0
+    lost = (scans[:, near] == 3.0).mean()
+    assert 0.015 < lost < 0.025
+    errors = (scans - exact)[:, near][scans[:, near] < 3.0]
+    assert abs(errors.mean()) < 0.001
+    assert 0.0095 < errors.std() < 0.0105
+
+
+# Worlds
+
+
+def test_shipped_worlds_are_what_they_say() -> None:
+    assert len(RECTANGLE.dstates) == 8
+    assert len({s.place for s in RECTANGLE.dstates}) == len({s.path for s in RECTANGLE.dstates}) == 4
+    assert len(HALL.dstates) == 20
+    assert len({s.place for s in HALL.dstates}) == 7
+    assert len({s.path for s in HALL.dstates}) == 4
+    assert len(HALL.route) == 24
+
+
+def test_a_world_from_an_occupancy_map(tmp_path: Path) -> None:
+    cells = np.full((24, 44), 254, np.uint8)
+    cells[[0, 1, -2, -1]] = cells[:, [0, 1, -2, -1]] = 0
+    for head, body in (
+        (b"P5 44 24 255\n", cells.tobytes()),
+        (b"P2\n# drawn by hand\n44 24\n255\n", " ".join(map(str, cells.ravel())).encode()),
+    ):
+        (tmp_path / "map.pgm").write_bytes(head + body)
+        (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.1\norigin: [-0.2, -0.2, 0.0]\nnegate: 0\noccupied_thresh: 0.65\n")
+        world = World.named(str(tmp_path / "map.yaml"))
+        assert world.bounds == pytest.approx((-0.2, -0.2, 4.2, 2.2))
+        ranges = Laser().exact(world, np.array([[1.0, 0.5, 0.0]]))[0]
+        assert ranges[0] == pytest.approx(0.5, abs=0.01)
+        assert ranges[-1] == pytest.approx(1.5, abs=0.01)
+        driven = simulate(world.with_choices("3.4,1.4,0", "right,travel,right,travel,right,travel,right,travel", 0.6), tours=2)
+        assert len(driven) == 16
+
+
+@pytest.mark.parametrize(
+    ("yaml", "pgm", "message"),
+    [
+        ("resolution: 0.1\norigin: [0, 0, 0]\n", b"", "expected image, resolution and origin"),
+        ("image: m.pgm\nresolution: no\norigin: [0, 0, 0]\n", b"", "expected image, resolution and origin"),
+        ("image: m.pgm\nresolution: -1\norigin: [0, 0, 0]\n", b"", "expected a resolution above 0"),
+        ("image: no.pgm\nresolution: 1\norigin: [0, 0, 0]\n", b"", "expected a PGM image"),
+        ("image: m.pgm\nresolution: 1\norigin: [0, 0, 0]\n", b"GIF89a", "expected a PGM image"),
+        ("image: m.pgm\nresolution: 1\norigin: [0, 0, 0]\n", b"P5 9 9 255\nshort", "expected 9 x 9 pixels, got fewer"),
+        ("image: m.pgm\nresolution: 1\norigin: [0, 0, 0]\n", b"P5 2 2 255\n\xff\xff\xff\xff", "without occupied cells"),
+    ],
+)
+def test_bad_occupancy_maps(yaml: str, pgm: bytes, message: str, tmp_path: Path) -> None:
+    (tmp_path / "m.yaml").write_text(yaml)
+    (tmp_path / "m.pgm").write_bytes(pgm)
+    with pytest.raises(SimulatorError, match=message):
+        World.named(str(tmp_path / "m.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": "map"}, "format: expected"),
+        ({"version": 2}, "format: expected"),
+        ({"polygons": []}, "polygons: expected at least one wall"),
+        ({"polygons": [[[0, 0], [1, 1]]]}, r"polygons\[0\]: expected at least three points"),
+        ({"polygons": [[[0, 0], [1, 1], [0, "a"]]]}, r"polygons\[0\]\[2\]: expected 2 finite numbers"),
+        ({"segments": [[1, 2, 3]]}, r"segments\[0\]: expected 4 finite numbers"),
+        ({"route": ["fly"]}, r"route\[0\]: expected travel, right, left or around"),
+        ({"reach": 0}, "reach: expected metres above 0"),
+        ({"start": [1]}, "start: expected 3 finite numbers"),
+        ({"clutter": [3]}, r"clutter\[0\]: expected an object"),
+        ({"clutter": [{"polygon": [[0, 0], [1, 0], [1, 1]], "present": 2}]}, r"clutter\[0\].present: expected a probability"),
+        ({"dstates": [{"name": "a"}]}, r"dstates\[0\]: expected an object"),
+    ],
+)
+def test_bad_worlds_name_the_field(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(SimulatorError, match=message):
+        world_of(tmp_path, **changes)
+
+
+def test_worlds_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(SimulatorError, match="expected one of notched-rectangle, taylor-hall, or a file"):
+        World.named("atlantis")
+    with pytest.raises(SimulatorError, match="check the path"):
+        World.named(str(tmp_path / "no.json"))
+    (tmp_path / "broken.json").write_text("{")
+    with pytest.raises(SimulatorError, match="expected a world in JSON"):
+        World.named(str(tmp_path / "broken.json"))
+    for choice in ({"start": "a,b"}, {"start": "1,2"}, {"route": "up"}, {"reach": -1.0}):
+        with pytest.raises(SimulatorError):
+            RECTANGLE.with_choices(**choice)  # type: ignore[arg-type]
+
+
+# Sight and control
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.floats(0.45, 0.75), st.floats(0.45, 0.75), st.floats(-12, 12), st.sampled_from(range(4)))
+def test_sight_measures_the_corner_that_it_sees(ahead: float, left: float, degrees: float, corner: int) -> None:
+    """In a room without a notch, facing into each corner: distances to both walls, and the tilt, to a few millimetres and tenths of a degree."""
+    quarter = -corner * math.pi / 2
+    room = np.array([[0, 0, 4, 0], [4, 0, 4, 2], [4, 2, 0, 2], [0, 2, 0, 0]], float)
+    sizes = [(4 - ahead, 2 - left), (4 - left, ahead), (ahead, left), (left, 2 - ahead)]
+    pose = (*sizes[corner], quarter + math.radians(degrees))
+    image = Laser().scan(replace(RECTANGLE, segments=room), np.repeat([pose], 9, axis=0), np.random.default_rng(0))
+    seen = sight(np.median(image, axis=0), 0.6, 8.0)
+    assert seen.front == pytest.approx(ahead, abs=0.01)
+    assert seen.left == pytest.approx(left, abs=0.01)
+    assert math.degrees(seen.tilt) == pytest.approx(degrees, abs=0.5)
+    assert seen.to_go(0.6) == pytest.approx(ahead - 0.6, abs=0.01)
+    assert seen.offset(0.6) == pytest.approx(0.6 - left, abs=0.01)
+
+
+def test_an_image_of_nothing_shows_nothing() -> None:
+    seen = sight(np.full(180, 8.0), 1.0, 8.0)
+    assert (seen.front, seen.left, seen.right, seen.to_go(1.0), seen.offset(1.0)) == (None, None, None, None, None)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(st.floats(-0.05, 0.05), st.floats(-0.012, 0.012), st.floats(-10, 10), st.integers(0, 10**6))
+def test_hill_climbing_ends_at_the_fixed_point(dx: float, dy: float, degrees: float, seed: int) -> None:
+    """From anywhere near x0, along the way and in heading, the robot comes to within the tolerance of the law."""
+    rng = np.random.default_rng(seed)
+    robot = Robot(Body(), (3.4 + dx, 1.4 + dy, math.radians(degrees)), rng)
+    climb(Driver(RECTANGLE, robot, Laser(), rng))
+    x, y, heading = robot.pose
+    assert abs(x - 3.4) < 0.025
+    assert abs(y - 1.4) < 0.04
+    assert abs(math.degrees(heading)) < 1.5
+
+
+def test_control_never_reads_the_true_pose() -> None:
+    """The same scans, the same commands: a driver whose robot claims to be elsewhere does what the images say."""
+    commands: list[list[tuple[float, float]]] = []
+    for lie in (False, True):
+        rng = np.random.default_rng(5)
+        robot = Robot(Body(), RECTANGLE.start, rng)
+        driver = Driver(RECTANGLE, robot, Laser(), rng)
+        told: list[tuple[float, float]] = []
+        honest = robot.move
+
+        def move(forward: float, turn: float, honest: Any = honest, told: Any = told) -> None:
+            told.append((forward, turn))
+            honest(forward, turn)
+
+        robot.move = move  # type: ignore[method-assign]
+        if lie:
+            shift = np.array([100.0, 50.0, 100.0, 50.0])
+            driver.world = replace(RECTANGLE, segments=RECTANGLE.segments + shift)
+            robot.pose = (robot.pose[0] + 100.0, robot.pose[1] + 50.0, robot.pose[2])
+        for action in ("right", "travel", "right", "travel"):
+            act(driver, action)
+        commands.append(told)
+    np.testing.assert_allclose(commands[0], commands[1], atol=1e-6)
+
+
+# Tours
+
+
+def test_every_dstate_is_reached_in_order(circuits: Trace, tours: Trace) -> None:
+    assert [step.truth["dstate"] for step in circuits.steps] == [f"x{i % 8}" for i in range(400)]
+    assert [a.name for a in circuits.actions[:8]] == list(RECTANGLE.route)
+    once = [step.truth["dstate"] for step in tours.steps[:24]]
+    assert [step.truth["dstate"] for step in tours.steps] == once * 3
+    assert len(set(once)) == 20
+
+
+def test_errors_do_not_add_up(circuits: Trace) -> None:
+    """The spread of the pose at the dstates in the last ten circuits is that in the first ten."""
+    for poses in poses_by_dstate(circuits).values():
+        off = np.abs(poses[:, :2] - poses[:, :2].mean(0)).max(1)
+        assert off.max() < 0.025
+        assert np.abs(np.unwrap(poses[:, 2]) - np.unwrap(poses[:, 2]).mean()).max() < math.radians(2)
+    first = np.array([np.abs(p[:10, :2] - p[:, :2].mean(0)).mean() for p in poses_by_dstate(circuits).values()])
+    last = np.array([np.abs(p[-10:, :2] - p[:, :2].mean(0)).mean() for p in poses_by_dstate(circuits).values()])
+    assert last.mean() < 1.5 * first.mean()
+
+
+def test_without_hill_climbing_errors_do_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The test above can fail: dead reckoning for two sides loses the corner."""
+    rng = np.random.default_rng(0)
+    ends = []
+    for _ in range(30):
+        robot = Robot(Body(), (3.4, 1.4, -math.pi / 2), rng)
+        for forward, turn in ((0.8, 0.0), (0.0, -math.pi / 2), (2.8, 0.0)):
+            robot.move(forward, turn)
+        ends.append(robot.pose[:2])
+    assert np.std(ends, axis=0).max() > 0.05
+
+
+def test_odometry_drifts_and_is_not_the_truth(circuits: Trace) -> None:
+    rng = np.random.default_rng(0)
+    robot = Robot(Body(), (0.0, 0.0, 0.0), rng)
+    for _ in range(200):
+        robot.move(0.1, 0.05)
+    assert math.dist(robot.pose[:2], robot.odometry[:2]) > 0.001
+
+
+def test_the_openings_seen_are_those_that_are_there(tours: Trace) -> None:
+    straight = {"P1": "ES", "P2": "EWS", "P3": "EWS", "E": "W", "D1": "N", "D2": "N", "D3": "N"}
+    headings = {"north": "NESW", "east": "ESWN", "south": "SWNE", "west": "WNES"}
+    for step in tours.steps:
+        place, heading = step.truth["dstate"].split()
+        assert step.star == tuple(float(side in straight[place]) for side in headings[heading])
+
+
+def test_the_same_seed_gives_the_same_trace() -> None:
+    assert simulate(RECTANGLE, 2, seed=7) == simulate(RECTANGLE, 2, seed=7)
+    assert simulate(RECTANGLE, 2, seed=7) != simulate(RECTANGLE, 2, seed=8)
+
+
+def test_traces_of_tours_survive_files(tmp_path: Path) -> None:
+    trace = simulate(RECTANGLE, 2, seed=7)
+    trace.save(tmp_path / "run.jsonl")
+    assert Trace.load(tmp_path / "run.jsonl") == trace
+    assert trace.steps[-1].action is None
+    assert all(step.view is None for step in trace.steps)
+
+
+def test_images_at_even_distances() -> None:
+    trace = simulate(RECTANGLE, 3, seed=7, every=0.5)
+    poses = np.array([step.truth["pose"][:2] for step in trace.steps])
+    assert len(trace) == pytest.approx(3 * 7.2 / 0.5, rel=0.15)
+    assert np.median(np.hypot(*np.diff(poses, axis=0).T)) == pytest.approx(0.5, abs=0.15)
+
+
+def test_clutter_moves_between_tours_only() -> None:
+    rng = np.random.default_rng(0)
+    one, other = HALL.arranged(rng), HALL.arranged(rng)
+    assert one.segments.shape[0] - len(HALL.segments) in range(4 * (len(HALL.clutter) - 1), 4 * len(HALL.clutter) + 1)
+    assert not np.array_equal(one.segments[-40:], other.segments[-40:])
+    np.testing.assert_array_equal(one.segments[: len(HALL.segments)], HALL.segments)
+
+
+# What cannot be driven
+
+
+def test_a_start_inside_a_wall(tmp_path: Path) -> None:
+    for start in ([0.1, 1, 0], [4, 1, 0], [9, 9, 0]):
+        with pytest.raises(SimulatorError, match=r"start: expected a place 0\.2 m off the walls"):
+            simulate(world_of(tmp_path, start=start))
+
+
+def test_a_route_into_a_wall(tmp_path: Path) -> None:
+    with pytest.raises(SimulatorError, match=r"travel at \(3\.\d\d, 1\.\d\d\): expected a free way ahead, got a wall"):
+        simulate(world_of(tmp_path, route=["travel"]), tours=2)
+
+
+def test_a_gap_through_which_the_robot_escapes(tmp_path: Path) -> None:
+    corridor = {
+        "polygons": [],
+        "segments": [[0, 0, 9, 0], [0, 2, 9, 2], [0, 0, 0, 2]],
+        "start": [1, 1, 0],
+        "reach": 1.0,
+        "route": ["travel"],
+    }
+    with pytest.raises(SimulatorError, match=r"the robot left the world at \(9\.\d+, 1\.\d+\); close the gap"):
+        simulate(world_of(tmp_path, **corridor), tours=2)
+
+
+def test_no_route_and_no_tours(tmp_path: Path) -> None:
+    with pytest.raises(SimulatorError, match="route: expected at least one action"):
+        simulate(world_of(tmp_path, route=[]))
+    with pytest.raises(SimulatorError, match="tours: expected 1 or more"):
+        simulate(RECTANGLE, tours=0)
