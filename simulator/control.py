@@ -25,11 +25,22 @@ Array = NDArray[np.float64]
 TURNS = {"left": math.pi / 2, "right": -math.pi / 2, "around": math.pi}
 STRIDE = 0.15  # metres between two images while travelling
 STILL = 9  # images whose median is taken at rest: noise shrinks, lost beams vanish
-CLOSE = 0.015  # metres, and
-STRAIGHT = math.radians(0.75)  # radians: hill-climbing ends here, as near as such a base can be steered
-ASIDE = 0.015  # metres off the line that are worth backing off and coming again
 TRIES = 12
 LONGEST_TRAVEL = 300.0  # metres
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """When hill-climbing is content: as near as such a base can be steered.
+
+    close     metres along the way
+    straight  radians of heading
+    aside     metres off the line; worse than that, the robot backs off and comes again
+    """
+
+    close: float = 0.015
+    straight: float = math.radians(0.75)
+    aside: float = 0.015
 
 
 @dataclass
@@ -40,6 +51,7 @@ class Driver:
     robot: Robot
     laser: Laser
     rng: np.random.Generator
+    tolerance: Tolerance = Tolerance()
     on_travel: Callable[[Driver], None] | None = None
 
     def look(self, images: int = 1) -> Array:
@@ -105,19 +117,19 @@ def _steer(seen: Sight, reach: float, stride: float) -> float:
 
 def climb(driver: Driver, turned: bool = False) -> None:
     """Hill-climb to the fixed point: along the way, across it, and in heading. After a turn, only what needs no manoeuvre."""
-    reach = driver.world.reach
+    reach, tolerance = driver.world.reach, driver.tolerance
     for attempt in range(TRIES):
         seen = driver.see(STILL)
         to_go, offset = seen.to_go(reach), seen.offset(reach)
         aside = abs(offset) if offset is not None else 0.0
-        if aside > ASIDE and to_go is not None and abs(to_go) < 0.1 and not turned and attempt < TRIES // 2:
+        if aside > tolerance.aside and to_go is not None and abs(to_go) < 0.1 and not turned and attempt < TRIES // 2:
             _come_again(driver)
             continue
-        if abs(seen.tilt) > STRAIGHT:
+        if abs(seen.tilt) > tolerance.straight:
             driver.go(0.0, -seen.tilt)
-        if to_go is not None and CLOSE < abs(to_go) < 0.5 * reach:
+        if to_go is not None and tolerance.close < abs(to_go) < 0.5 * reach:
             driver.go(to_go)
-        elif abs(seen.tilt) <= STRAIGHT:
+        elif abs(seen.tilt) <= tolerance.straight:
             return
 
 

@@ -54,10 +54,10 @@ def read_pgm(path: Path) -> NDArray[np.float64]:
             values = np.array(body.split(), dtype=float)
         else:
             values = np.frombuffer(body, dtype=np.uint8 if white < 256 else ">u2").astype(float)
-        table: NDArray[np.float64] = values[: rows * columns].reshape(rows, columns) / white
+        table = values[: rows * columns].reshape(rows, columns)
     except ValueError:
         raise SimulatorError(f"{path}: expected {rows} x {columns} pixels, got fewer; the file was cut, or is no PGM") from None
-    return table
+    return table / white
 
 
 def _edges(occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, float], path: Path) -> NDArray[np.float64]:
@@ -73,4 +73,5 @@ def _edges(occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, 
                 found.append((row, first, row, last) if flipped else (first, row, last, row))
     if not found:
         raise SimulatorError(f"{path}: expected walls, got a map without occupied cells; check occupied_thresh and negate")
-    return np.array(found, dtype=float) * resolution + np.array([*origin, *origin])
+    segments: NDArray[np.float64] = np.array(found, dtype=float) * resolution + np.array([*origin, *origin])
+    return segments

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.control import STILL, Driver, act, climb
+from simulator.control import STILL, Driver, Tolerance, act, climb
 from simulator.errors import SimulatorError
 from simulator.laser import Laser
 from simulator.robot import Body, Robot
@@ -50,6 +50,7 @@ def simulate(
     *,
     laser: Laser | None = None,
     body: Body | None = None,
+    tolerance: Tolerance | None = None,
     stars: bool = True,
     every: float | None = None,
 ) -> Trace:
@@ -71,7 +72,7 @@ def simulate(
         raise SimulatorError(f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, {y}); move it")
     rng = np.random.default_rng(seed)
     robot = Robot(body, world.start, rng)
-    driver = Driver(world.arranged(rng), robot, laser or Laser(), rng)
+    driver = Driver(world.arranged(rng), robot, laser or Laser(), rng, tolerance or Tolerance())
     logged = _evenly(driver, world, tours, every) if every else _at_dstates(driver, world, tours, stars)
     steps = list(logged)
     steps[-1] = Step(image=steps[-1].image, star=steps[-1].star, truth=steps[-1].truth)

@@ -15,7 +15,7 @@ import math
 import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias
 
@@ -202,10 +202,17 @@ class Trace:
         )
         return cls(steps, name=name)
 
+    def with_views(self, views: Iterable[View]) -> Trace:
+        """This trace with a view a step. Raises TraceError."""
+        seen = list(views)
+        if len(seen) != len(self):
+            raise TraceError(f"views: expected {len(self)}, one a step, got {len(seen)}")
+        return replace(
+            self, steps=tuple(replace(s, view=_view(v, f"views[{i}]")) for i, (s, v) in enumerate(zip(self.steps, seen, strict=True)))
+        )
+
     def prefix(self, steps: int) -> Trace:
         """The first `steps` steps of this trace."""
-        from dataclasses import replace
-
         head = self.steps[:steps]
         if head:
             head = (*head[:-1], replace(head[-1], action=None))

@@ -12,7 +12,8 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from ssh_abduction.cli import check, facts, show, solve, theory
+from ssh_abduction.cli import check, cluster, facts, show, simulate, solve, theory, train
+from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.errors import SSHError
 
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
@@ -28,7 +29,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
     verbs = top.add_subparsers(metavar="VERB", required=True)
-    for verb in (solve, check, show, facts, theory):
+    for verb in (solve, check, show, facts, theory, simulate, cluster, train, reproduction):
         verb.add_parser(verbs)
     return top
 

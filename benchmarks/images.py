@@ -1,0 +1,87 @@
+"""Images: simulated ones a second, clustering with the search for k by M, and nearest-neighbour queries a second.
+
+    python benchmarks/images.py [SIZE ...]
+
+Time and peak memory, each in a process of its own, one run, on the machine as it is. Images are of the notched rectangle: from poses near
+its eight dstates ("dstates"), and from poses anywhere ("anywhere"), where there are no clusters to find: the slowest case.
+"""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.reciprocal import ReciprocalTransformer
+from perception.recognition import PlaceRecognizer
+from perception.views import ViewClusterer
+from simulator.laser import Laser
+from simulator.tours import simulate
+from simulator.world import World
+
+SIZES = (400, 4_000, 40_000)
+MOST_VIEWS = 40
+WORLD = World.named("notched-rectangle")
+
+
+def ranges(kind: str, count: int, seed: int = 0) -> NDArray[np.float64]:
+    """Images, (count, 180), in metres."""
+    rng = np.random.default_rng(seed)
+    if kind == "dstates":
+        ideal = np.array([s.pose for s in WORLD.dstates])
+        poses = ideal[np.arange(count) % len(ideal)] + rng.normal(0, [0.005, 0.005, 0.005], (count, 3))
+    else:
+        poses = rng.uniform([0.3, 0.3, -np.pi], [3.7, 1.7, np.pi], (count, 3))
+    return Laser().scan(WORLD, poses, rng)
+
+
+def simulated(world: str) -> None:
+    """Scan from many poses at once, and drive, and print two lines of the table."""
+    room, rng = World.named(world), np.random.default_rng(0)
+    poses = np.repeat([s.pose for s in room.dstates], 20_000 // len(room.dstates), axis=0)
+    began = time.perf_counter()
+    Laser().scan(room, poses, rng)
+    print(f"{world:18} {len(poses) / (time.perf_counter() - began):9,.0f} images a second, all poses at once", flush=True)
+    began = time.perf_counter()
+    steps = len(simulate(room, tours=5))
+    print(f"{world:18} {steps / (time.perf_counter() - began):9,.0f} dstates a second, driving", flush=True)
+
+
+def search(kind: str, count: int) -> None:
+    """Search for k, and print a line of the table."""
+    images = ReciprocalTransformer().fit_transform(ranges(kind, count))
+    began = time.perf_counter()
+    views = ViewClusterer(k_max=MOST_VIEWS, random_state=0).fit(images)
+    seconds = time.perf_counter() - began
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+    print(f"{kind:9} {count:7,} images, k = 2 … {MOST_VIEWS}: {seconds:7.1f} s, peak {peak:6.0f} MB, k = {views.k_}", flush=True)
+
+
+def queries(kind: str, count: int) -> None:
+    """Ask for the nearest of `count` images, and print a line of the table."""
+    images = ReciprocalTransformer().fit_transform(ranges(kind, count + 2_000))
+    recogniser = PlaceRecognizer().fit(images[:count], np.arange(count) % 8)
+    began = time.perf_counter()
+    recogniser.predict(images[count:])
+    seconds = time.perf_counter() - began
+    print(f"{kind:9} {count:7,} images known: {2_000 / seconds:9,.0f} queries a second", flush=True)
+
+
+def main() -> None:
+    if sys.argv[1:2] in (["search"], ["queries"]):
+        (search if sys.argv[1] == "search" else queries)(sys.argv[2], int(sys.argv[3]))
+        return
+    for world in ("notched-rectangle", "taylor-hall"):
+        simulated(world)
+    for job in ("search", "queries"):
+        for kind in ("dstates", "anywhere"):
+            for count in [int(size) for size in sys.argv[1:]] or SIZES:
+                subprocess.run([sys.executable, __file__, job, kind, str(count)], check=True)
+
+
+if __name__ == "__main__":
+    main()

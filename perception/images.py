@@ -1,0 +1,54 @@
+"""The images of a trace as one table."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.errors import PerceptionError
+from ssh_abduction.trace import Trace
+
+
+def images_of(trace: Trace) -> NDArray[np.float64]:
+    """The images of all steps, (n, d) ranges in metres, inline or from the sidecar file (.npy, or .npz with one array or `images`).
+
+    Raises PerceptionError where a step has no image, lengths differ, or the sidecar file cannot be read.
+    """
+    held = [step.image for step in trace.steps]
+    for i, image in enumerate(held):
+        if image is None:
+            raise PerceptionError(f"{trace.at(i)}: image: expected one, got none; log an image at each step")
+    if any(isinstance(image, int) for image in held):
+        table = _sidecar(trace)
+        rows: list[Any] = []
+        for i, image in enumerate(held):
+            if isinstance(image, int) and image >= len(table):
+                raise PerceptionError(
+                    f"{trace.at(i)}: image: expected an index below {len(table)}, got {image}; {trace.images} has no more"
+                )
+            rows.append(table[image] if isinstance(image, int) else image)
+        held = rows
+    beams = len(held[0])  # type: ignore[arg-type]
+    for i, image in enumerate(held):
+        if len(image) != beams:  # type: ignore[arg-type]
+            raise PerceptionError(f"{trace.at(i)}: image: expected {beams} ranges, as the first has, got {len(image)}")  # type: ignore[arg-type]
+    return np.array(held, dtype=float)
+
+
+def _sidecar(trace: Trace) -> NDArray[np.float64]:
+    if trace.images is None:
+        raise PerceptionError(f"{trace.at(0)}: image: expected the header to name a file of images for the indices, got none; add images")
+    path = Path(trace.source or ".").parent / trace.images
+    try:
+        with path.open("rb") as file:  # numpy leaves a damaged file open
+            data = np.load(file, allow_pickle=False)
+            table = data if isinstance(data, np.ndarray) else data["images" if "images" in data else data.files[0]]
+    except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile, EOFError) as error:
+        raise PerceptionError(f"{path}: expected a .npy or .npz file of images: {error}; check the header's images") from None
+    if table.ndim != 2 or not np.issubdtype(table.dtype, np.number):
+        raise PerceptionError(f"{path}: expected a table of images x ranges, got shape {table.shape}; store one image a row")
+    return table.astype(float)

@@ -1,0 +1,58 @@
+"""Ranges to reciprocals: what is near matters most, and "nothing seen" is simply far.
+
+>>> ReciprocalTransformer().fit_transform([[0.5, 2.0, 100.0]])
+array([[2.  , 0.5 , 0.01]])
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, OneToOneFeatureMixin, TransformerMixin
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from perception.errors import ImageWarning, PerceptionError, equal_length
+
+
+class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]
+    """1 / max(r, floor), for images of ranges r in metres, (n, d). Distances between images are Euclidean on these (Kuipers and Beeson 2002).
+
+    floor: the shortest range that is believed, in metres, > 0.
+
+    A laser says "nothing seen" with +inf, and some drop a beam as NaN: both become 0, infinitely far. Ranges of zero or less are no
+    measurement: they are clipped to the floor. `transform` counts these in one ImageWarning; ranges between 0 and the floor are clipped
+    without one. Raises PerceptionError for a floor that is not a positive number, ValueError for images that are not an (n, d) table.
+    """
+
+    def __init__(self, floor: float = 0.05) -> None:
+        self.floor = floor
+
+    def fit(self, X: ArrayLike, y: Any = None) -> Self:
+        """Learn the number of beams, and nothing else."""
+        if not (isinstance(self.floor, int | float | np.number) and 0 < self.floor < np.inf):
+            raise PerceptionError(f"floor: expected a positive number of metres, got {self.floor!r}")
+        validate_data(self, equal_length(X), dtype=np.float64, ensure_all_finite=False)
+        return self
+
+    def transform(self, X: ArrayLike) -> NDArray[np.float64]:
+        """The reciprocals, (n, d), in 1/m, within [0, 1 / floor]."""
+        check_is_fitted(self)
+        ranges = validate_data(self, equal_length(X), dtype=np.float64, ensure_all_finite=False, reset=False)
+        infinite, missing, without = np.isposinf(ranges), np.isnan(ranges), ranges <= 0
+        counts = [int(np.count_nonzero(part)) for part in (infinite, missing, without)]
+        if any(counts):
+            warnings.warn(
+                f"{sum(counts)} of {ranges.size} ranges were replaced: {counts[0]} infinite and {counts[1]} missing (NaN) "
+                f"are taken as nothing seen, {counts[2]} of zero or less as {self.floor} m",
+                ImageWarning,
+                stacklevel=2,
+            )
+        return np.where(infinite | missing, 0.0, 1 / np.maximum(ranges, self.floor))
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.allow_nan = True
+        return tags

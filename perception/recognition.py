@@ -1,0 +1,143 @@
+"""Images to places, once the map has labelled them: the nearest image seen before tells where the robot is.
+
+>>> recogniser().fit([[1.0, 4.0], [3.0, 3.0]], ["corner", "hall"]).predict([[1.1, 4.2]]).tolist()
+['corner']
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, ClassifierMixin, clone
+from sklearn.neighbors import KNeighborsClassifier
+from sklearn.pipeline import Pipeline
+from sklearn.utils import check_random_state
+from sklearn.utils.multiclass import check_classification_targets
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from perception.errors import ImageWarning, PerceptionError, equal_length
+from perception.reciprocal import ReciprocalTransformer
+
+
+class PlaceRecognizer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+    """The label of the nearest image, or the commonest among the `n_neighbors` nearest (Euclidean distance).
+
+    Attributes: classes_, (c,); neighbours_, the fitted KNeighborsClassifier. Raises PerceptionError for a number of neighbours that is
+    not in 1 … n, and ValueError for images that are not a finite (n, d) table or labels that are not classes.
+    """
+
+    def __init__(self, n_neighbors: int = 1) -> None:
+        self.n_neighbors = n_neighbors
+
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Remember images, (n, d), and their labels, (n,)."""
+        images, labels = validate_data(self, equal_length(X), y, dtype=np.float64)
+        number = self.n_neighbors
+        if not isinstance(number, int | np.integer) or isinstance(number, bool) or not 1 <= number <= len(images):
+            raise PerceptionError(f"n_neighbors: expected a whole number from 1 to the {len(images)} images, got {number!r}")
+        with warnings.catch_warnings():  # dstates seen once or twice are no sign of regression
+            warnings.filterwarnings("ignore", "The number of unique classes")
+            check_classification_targets(labels)
+            # Trees do not help in 180 dimensions, and a table of images is the safer thing to store.
+            self.neighbours_ = KNeighborsClassifier(number, algorithm="brute").fit(images, labels)
+        self.classes_ = self.neighbours_.classes_
+        return self
+
+    def predict(self, X: ArrayLike) -> NDArray[Any]:
+        """Labels, (n,)."""
+        return np.asarray(self._neighbours().predict(self._images(X)))
+
+    def predict_proba(self, X: ArrayLike) -> NDArray[np.float64]:
+        """Share of the neighbours that have each of `classes_`, (n, c)."""
+        return np.asarray(self._neighbours().predict_proba(self._images(X)), np.float64)
+
+    def _neighbours(self) -> Any:
+        check_is_fitted(self)
+        return self.neighbours_
+
+    def _images(self, X: ArrayLike) -> Any:
+        return validate_data(self, equal_length(X), dtype=np.float64, reset=False)
+
+
+def recogniser(floor: float = 0.05, n_neighbors: int = 1) -> Pipeline:
+    """From ranges in metres, (n, d), to labels: reciprocals, then the nearest neighbour. Not fitted yet."""
+    return Pipeline([("reciprocal", ReciprocalTransformer(floor)), ("nearest", PlaceRecognizer(n_neighbors))])
+
+
+@dataclass(frozen=True)
+class LearningCurve:
+    """Recognition rate against experience.
+
+    sizes      (s,) how many images, from the first on, had been seen
+    mean, lowest, highest  (s,) share of images recognised, in [0, 1], over the folds
+    folds      how many folds there were
+    untested   classes with a single image, which are never tested: without it they cannot be known
+    """
+
+    sizes: tuple[int, ...]
+    mean: tuple[float, ...]
+    lowest: tuple[float, ...]
+    highest: tuple[float, ...]
+    folds: int
+    untested: tuple[Any, ...] = ()
+
+
+def learning_curve(
+    X: ArrayLike,
+    y: ArrayLike,
+    sizes: Iterable[int],
+    folds: int = 10,
+    random_state: int | np.random.RandomState | None = None,
+    estimator: Any = None,
+) -> LearningCurve:
+    """The recognition rate by cross-validation, against the number of images (Kuipers and Beeson 2002, the learning curves).
+
+    The n images, (n, d), in the order in which they were seen, are dealt into `folds` parts, each class spread evenly. For each size m and
+    each fold, a clone of `estimator` (default: `recogniser()`, so images are ranges in metres) learns from those of the first m images
+    that are not in the fold, and is tested on the whole fold. All sizes are thus tested on the same images, also of places not yet seen
+    after m images: these count as errors. A training part without images recognises nothing.
+
+    Raises PerceptionError for sizes outside 1 … n, fewer than 2 folds, or fewer images to test than folds.
+    """
+    estimator = recogniser() if estimator is None else estimator
+    images, labels = np.asarray(equal_length(X)), np.asarray(y)
+    clone(estimator).fit(images, labels)  # what is wrong with the images is said once, here
+    wanted = tuple(int(size) for size in sizes)
+    for size in wanted:
+        if not 1 <= size <= len(images):
+            raise PerceptionError(f"sizes: expected numbers from 1 to the {len(images)} images, got {size}")
+    fold, untested = _deal(labels, folds, random_state)
+    rates = np.zeros((len(wanted), folds))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ImageWarning)
+        for f in range(folds):
+            test = fold == f
+            for s, size in enumerate(wanted):
+                train = np.flatnonzero(~test[:size])
+                if len(train):
+                    rates[s, f] = np.mean(clone(estimator).fit(images[train], labels[train]).predict(images[test]) == labels[test])
+    mean, lowest, highest = (tuple(part.tolist()) for part in (rates.mean(axis=1), rates.min(axis=1), rates.max(axis=1)))
+    return LearningCurve(wanted, mean, lowest, highest, folds, untested)
+
+
+def _deal(labels: NDArray[Any], folds: int, random_state: Any) -> tuple[NDArray[np.intp], tuple[Any, ...]]:
+    """The fold of each image, -1 for those never tested, and the classes that are never tested.
+
+    Cards of one class after the other are dealt round, so that folds differ by at most one image, in all and in every class.
+    """
+    if folds < 2:
+        raise PerceptionError(f"folds: expected at least 2, got {folds}")
+    classes, of, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    shuffled = check_random_state(random_state).permutation(len(labels))
+    cards = shuffled[np.argsort(of[shuffled], kind="stable")]
+    cards = cards[counts[of[cards]] > 1]
+    if len(cards) < folds:
+        raise PerceptionError(f"folds: expected at most {len(cards)}, the images of places seen more than once, got {folds}")
+    fold = np.full(len(labels), -1, np.intp)
+    fold[cards] = np.arange(len(cards)) % folds
+    return fold, tuple(classes[counts == 1].tolist())

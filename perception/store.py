@@ -1,0 +1,98 @@
+"""A fitted recogniser in a file that cannot run code when it is read.
+
+The file is a skops archive: a description of types and arrays. Reading it makes objects of scikit-learn's own types and of those in
+`OURS`, and refuses anything else; a pickle is not an archive, and is refused unread.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import skops.io
+from sklearn.base import BaseEstimator
+
+from perception.errors import PerceptionError
+from perception.reciprocal import ReciprocalTransformer
+from perception.recognition import PlaceRecognizer
+from perception.views import ViewClusterer
+from ssh_abduction.errors import brief
+
+FORMAT, VERSION = "ssh-recogniser", 1
+OURS = tuple(f"{kind.__module__}.{kind.__qualname__}" for kind in (PlaceRecognizer, ReciprocalTransformer, ViewClusterer))
+LARGEST = 4 * 2**30  # bytes once unpacked: a small archive may claim to hold more than the memory
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a file holds.
+
+    model     the fitted estimator or pipeline
+    classes   its labels, in order; empty where it has none
+    versions  of Python, numpy, scikit-learn, skops and this package, when it was saved
+    """
+
+    model: Any
+    classes: tuple[Any, ...]
+    versions: Mapping[str, str]
+
+
+def save(model: Any, path: str | os.PathLike[str]) -> None:
+    """Write a fitted estimator or pipeline of this package's and scikit-learn's types. The file appears whole or not at all.
+
+    Raises PerceptionError where `load` would refuse it, or the file cannot be written.
+    """
+    classes = np.asarray(getattr(model, "classes_", ())).tolist()
+    versions = {name: version(name) for name in ("numpy", "scikit-learn", "skops", "ssh-abduction")} | {"python": platform.python_version()}
+    data = skops.io.dumps({"format": FORMAT, "version": VERSION, "model": model, "classes": classes, "versions": versions})
+    if foreign := _foreign(data=data):
+        raise PerceptionError(f"{path}: expected a model of types that can be read back, got {', '.join(foreign)}")
+    target = Path(path)
+    draft = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        draft.write_bytes(data)
+        draft.replace(target)
+    except OSError as error:
+        raise PerceptionError(f"{target}: cannot write the recogniser: {error.strerror or error}; check the folder") from None
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def load(path: str | os.PathLike[str]) -> Stored:
+    """Read what `save` wrote. Raises PerceptionError for anything else; nothing in the file is ever run."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(part.file_size for part in archive.infolist())
+        if unpacked > LARGEST:
+            raise PerceptionError(f"{path}: expected at most {LARGEST} bytes once unpacked, got {unpacked}")
+        if foreign := _foreign(file=path):
+            raise PerceptionError(
+                f"{path}: expected scikit-learn's and this package's types only, got {', '.join(foreign)}; do not trust it"
+            )
+        held = skops.io.load(path, trusted=list(OURS))
+    except PerceptionError:
+        raise
+    except OSError as error:
+        raise PerceptionError(f"{path}: expected a readable recogniser: {error.strerror or error}; check the path") from None
+    except Exception as error:  # a damaged archive fails in as many ways as it has parts
+        raise PerceptionError(f"{path}: expected a .skops file written by save, got something else ({type(error).__name__})") from error
+    if not isinstance(held, dict) or held.get("format") != FORMAT:
+        raise PerceptionError(f"{path}: expected a file of format {FORMAT}, got another object")
+    if held.get("version") != VERSION:
+        raise PerceptionError(f"{path}: expected version {VERSION}, got {brief(held.get('version'))}; use the program that wrote it")
+    for part, kind in (("model", BaseEstimator), ("classes", list), ("versions", dict)):
+        if not isinstance(held.get(part), kind):
+            raise PerceptionError(f"{path}: {part}: expected a {kind.__name__}, got {brief(held.get(part))}; save the recogniser again")
+    return Stored(held["model"], tuple(held["classes"]), held["versions"])
+
+
+def _foreign(**source: Any) -> list[str]:
+    """The types in a dump that are neither scikit-learn's nor ours."""
+    return sorted(set(skops.io.get_untrusted_types(**source)) - set(OURS))

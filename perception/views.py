@@ -1,0 +1,173 @@
+"""Images to views: clusters, as many as separate best.
+
+>>> import numpy as np
+>>> images = np.concatenate([np.random.default_rng(0).normal(c, 0.1, (20, 3)) for c in (0, 2, 5)])
+>>> ViewClusterer(random_state=0).fit(images).k_
+3
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, ClusterMixin, clone
+from sklearn.cluster import KMeans
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.neighbors import KNeighborsClassifier
+from sklearn.utils import check_random_state
+from sklearn.utils.validation import check_is_fitted, validate_data
+from threadpoolctl import threadpool_limits
+
+from perception.errors import ImageWarning, PerceptionError, equal_length
+from perception.quality import cluster_quality, spanning_tree
+
+MANY = 5_000  # images up to which k-means starts again and again on all of them; above, on a sample of as many
+ROUNDS = 30  # of k-means at most, where there are so many: first over the sample, then over all from the sample's best centres
+
+
+class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
+    """Clusters images, (n, d), into k views; k is given, or is the one in [k_min, k_max] with the largest M (eq. 5), the smallest of equals.
+
+    Parameters
+    ----------
+    k             number of views, or None to choose it by M
+    k_min, k_max  the range searched; k_max None is the least of 20 and n - 1. Both yield to the number of different images
+    clusterer     None for k-means, or any scikit-learn clusterer. It is cloned, and `n_clusters` set where it has that parameter;
+                  without (DBSCAN, HDBSCAN) it is used as it is, and finds k itself
+    n_init        starts of k-means. Above 5,000 images the starts are made on a random sample of 5,000, and the best is refined over all
+                  images, both in at most 30 rounds: a view too rare for the sample may then be missed
+    random_state  seed, RandomState or None; the clusterer's own seed, where it has one, comes before
+
+    Attributes
+    ----------
+    labels_           (n,) views of the fitted images; -1 where the clusterer says that an image is noise
+    k_                how many views there are, noise not counted
+    quality_          M for each k that was tried; for a clusterer without `n_clusters` M of its result (noise counts as a cluster)
+    cluster_centers_  (k, d), where the clusterer has centres
+    clusterer_        the fitted clusterer; None where all images are equal
+
+    All images equal: one view, with an ImageWarning. Raises PerceptionError for settings that contradict each other or the images,
+    and ValueError for images that are not a finite (n, d) table with n >= 2.
+    """
+
+    def __init__(
+        self,
+        k: int | None = None,
+        k_min: int = 2,
+        k_max: int | None = None,
+        clusterer: Any = None,
+        n_init: int = 10,
+        random_state: int | np.random.RandomState | None = None,
+    ) -> None:
+        self.k = k
+        self.k_min = k_min
+        self.k_max = k_max
+        self.clusterer = clusterer
+        self.n_init = n_init
+        self.random_state = random_state
+
+    def fit(self, X: ArrayLike, y: Any = None) -> Self:
+        self._check()
+        images = validate_data(self, equal_length(X), dtype=np.float64, ensure_min_samples=2)
+        if (images == images[0]).all():
+            return self._one_view(images)
+        seed = int(check_random_state(self.random_state).randint(2**31 - 1))
+        if self.clusterer is not None and "n_clusters" not in self.clusterer.get_params():
+            best = self._cluster(images, None, seed)
+            self.k_ = len(set(best.labels_.tolist()) - {-1})
+            self.quality_ = {self.k_: cluster_quality(images, best.labels_)}
+        elif self.k is not None:
+            if self.k > 1:
+                self._affordable(self.k, images)
+            best = self._cluster(images, self.k, seed)
+            self.k_ = self.k
+            self.quality_ = {self.k: cluster_quality(images, best.labels_)}
+        else:
+            best = self._search(images, seed)
+        return self._keep(best, images)
+
+    def predict(self, X: ArrayLike) -> NDArray[np.intp]:
+        """Views of images, (n,): the nearest centre's for k-means (any clusterer's own `predict`), else the nearest fitted image's."""
+        check_is_fitted(self)
+        images = validate_data(self, equal_length(X), dtype=np.float64, reset=False)
+        if self.clusterer_ is None:
+            return np.zeros(len(images), np.intp)
+        return np.asarray((self.clusterer_ if self.nearest_ is None else self.nearest_).predict(images), np.intp)
+
+    def _search(self, images: NDArray[np.float64], seed: int) -> Any:
+        """The clusterer at the k with the largest M; sets k_ and quality_."""
+        tree = spanning_tree(images)
+        most = min(20, len(images) - 1) if self.k_max is None else self.k_max
+        most = min(max(most, self.k_min), tree.distinct)
+        self._affordable(self.k_min, images, tree.distinct)
+        best, self.quality_, self.k_ = None, {}, 0
+        for k in range(self.k_min, most + 1):
+            tried = self._cluster(images, k, seed)
+            self.quality_[k] = cluster_quality(images, tried.labels_, tree)
+            if best is None or self.quality_[k] > self.quality_[self.k_]:
+                best, self.k_ = tried, k
+        return best
+
+    def _cluster(self, images: NDArray[np.float64], k: int | None, seed: int) -> Any:
+        """A fitted clusterer for k views."""
+        if self.clusterer is None:
+            return self._k_means(images, k, seed)
+        chosen = clone(self.clusterer)
+        settings = chosen.get_params()
+        if k is not None:
+            chosen.set_params(n_clusters=k)
+        if "random_state" in settings and settings["random_state"] is None and self.random_state is not None:
+            chosen.set_params(random_state=seed)
+        return chosen.fit(images)
+
+    def _k_means(self, images: NDArray[np.float64], k: int | None, seed: int) -> Any:
+        """k-means fitted to all images, from the best of several starts."""
+        with threadpool_limits(1):  # a round is short: two threads wait for each other longer than they work where cores are shared
+            if len(images) > MANY:
+                sample = np.random.default_rng(seed).choice(len(images), MANY, replace=False)
+                with warnings.catch_warnings():  # where the sample has fewer different images than views, more are found among all
+                    warnings.simplefilter("ignore", ConvergenceWarning)
+                    start = KMeans(k, n_init=self.n_init, max_iter=ROUNDS, random_state=seed).fit(images[sample]).cluster_centers_
+                return KMeans(k, init=start, n_init=1, max_iter=ROUNDS, random_state=seed).fit(images)
+            return KMeans(k, n_init=self.n_init, random_state=seed).fit(images)
+
+    def _keep(self, best: Any, images: NDArray[np.float64]) -> Self:
+        self.clusterer_ = best
+        self.labels_ = np.asarray(best.labels_, np.intp)
+        self.nearest_ = None if hasattr(best, "predict") else KNeighborsClassifier(1, algorithm="brute").fit(images, self.labels_)
+        if hasattr(best, "cluster_centers_"):
+            self.cluster_centers_ = best.cluster_centers_
+        elif hasattr(self, "cluster_centers_"):
+            del self.cluster_centers_
+        return self
+
+    def _one_view(self, images: NDArray[np.float64]) -> Self:
+        warnings.warn(f"all {len(images)} images are equal: they are taken as one view", ImageWarning, stacklevel=3)
+        self.clusterer_ = self.nearest_ = None
+        self.labels_, self.k_, self.quality_ = np.zeros(len(images), np.intp), 1, {1: math.nan}
+        self.cluster_centers_ = images[:1].copy()
+        return self
+
+    def _check(self) -> None:
+        for name in ("k", "k_min", "k_max", "n_init"):
+            value, least = getattr(self, name), 2 if name == "k_min" else 1
+            if value is None and name in ("k", "k_max"):
+                continue
+            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+                raise PerceptionError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+        if self.k is None and self.k_max is not None and self.k_max < self.k_min:
+            raise PerceptionError(f"k_max: expected at least k_min = {self.k_min}, got {self.k_max}")
+        if self.clusterer is not None and not (hasattr(self.clusterer, "fit") and hasattr(self.clusterer, "get_params")):
+            raise PerceptionError(f"clusterer: expected a scikit-learn clusterer, such as DBSCAN(), got {self.clusterer!r}")
+        if self.k is not None and self.clusterer is not None and "n_clusters" not in self.clusterer.get_params():
+            raise PerceptionError(f"k: {type(self.clusterer).__name__} finds the number of clusters itself; leave k out")
+
+    def _affordable(self, k: int, images: NDArray[np.float64], distinct: int | None = None) -> None:
+        """Raise where there are fewer different images than views."""
+        found = len(np.unique(images, axis=0)) if distinct is None else distinct
+        if found < k:
+            raise PerceptionError(f"k: expected at most {found}, as there are {found} different images among {len(images)}, got {k}")

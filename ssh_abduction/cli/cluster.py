@@ -1,0 +1,65 @@
+"""ssh-abduction cluster TRACE: images to views."""
+
+from __future__ import annotations
+
+import argparse
+
+from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.text import table
+from ssh_abduction.errors import SSHError
+from ssh_abduction.trace import Trace
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = "Cluster the images of a trace into views, as many as separate best (k by M), and write the trace with its views."
+    parser = verbs.add_parser("cluster", help="cluster images into views", description=text)
+    parser.add_argument("trace", help="trace file with images, or - for standard input")
+    parser.add_argument("-o", "--output", required=True, metavar="TRACE", help="trace file to write")
+    parser.add_argument("--k", type=int, help="number of views (default: the one with the largest M)")
+    parser.add_argument("--k-max", type=int, metavar="K", help="largest number of views to try (default: 20)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of k-means (default: 0)")
+    parser.add_argument("--plot", metavar="PNG", help="draw M, and U where the truth is known, against k")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    from perception.images import images_of
+    from perception.quality import uncertainty_coefficient
+    from perception.reciprocal import ReciprocalTransformer
+    from perception.views import ViewClusterer
+
+    trace = Trace.load(options.trace)
+    images = ReciprocalTransformer().fit_transform(images_of(trace))
+    clusterer = ViewClusterer(k=options.k, k_max=options.k_max, random_state=options.seed).fit(images)
+    truth = true_dstates(trace)
+    uncertainty: dict[int, float] = {}
+    if truth is not None:
+        for k in clusterer.quality_:
+            labels = clusterer.labels_ if k == clusterer.k_ else ViewClusterer(k=k, random_state=options.seed).fit(images).labels_
+            uncertainty[k] = uncertainty_coefficient(labels, truth)
+    trace.with_views(clusterer.labels_.tolist()).save(options.output)
+    rows = [
+        [k, f"{m:.3f}", *([f"{uncertainty[k]:.3f}"] if uncertainty else []), "chosen" if k == clusterer.k_ else ""]
+        for k, m in clusterer.quality_.items()
+    ]
+    print(table(["k", "M", *(["U"] if uncertainty else []), ""], rows))
+    print(f"{clusterer.k_} views of {len(images)} images in {options.output}")
+    if options.plot:
+        from ssh_abduction.reproduce.figures import draw_quality
+
+        draw_quality(options.plot, clusterer.quality_, uncertainty, clusterer.k_)
+    return 0
+
+
+def true_dstates(trace: Trace) -> list[str] | None:
+    """The true dstates, where every step tells one."""
+    found = [step.truth.get("dstate") if isinstance(step.truth, dict) else None for step in trace.steps]
+    return [str(name) for name in found] if all(name is not None for name in found) else None
+
+
+def known(trace: Trace) -> list[str]:
+    """The true dstates. Raises SSHError where a step tells none."""
+    truth = true_dstates(trace)
+    if truth is None:
+        raise SSHError("truth: expected a true dstate at every step, got a trace without; evaluate without --truth")
+    return truth

@@ -1,0 +1,33 @@
+"""ssh-abduction simulate WORLD: drive tours, log images and actions."""
+
+from __future__ import annotations
+
+import argparse
+
+from ssh_abduction.cli.options import Verbs
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = "Drive tours through a world, and log an image and an action at each dstate. Views are left to cluster."
+    parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
+    parser.add_argument("world", help="notched-rectangle, taylor-hall, a world file (.json), or an occupancy map (.yaml)")
+    parser.add_argument("--tours", type=int, default=1, metavar="N", help="how often the route is driven (default: 1)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all noise (default: 0)")
+    parser.add_argument("--no-stars", action="store_true", help="do not log the openings that the robot sees at each place")
+    parser.add_argument("--every", type=float, metavar="M", help="log an image each so many metres, rather than at dstates")
+    parser.add_argument("--start", metavar="X,Y,DEGREES", help="another start than the world's; write --start=-1,2,90")
+    parser.add_argument("--route", metavar="ACTIONS", help="another route than the world's; travel, right, left, around with commas")
+    parser.add_argument("--reach", type=float, metavar="M", help="metres from a wall at which the robot follows it")
+    parser.add_argument("-o", "--output", required=True, metavar="TRACE", help="trace file to write")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    from simulator.tours import simulate
+    from simulator.world import World
+
+    world = World.named(options.world).with_choices(options.start, options.route, options.reach)
+    trace = simulate(world, options.tours, options.seed, stars=not options.no_stars, every=options.every)
+    trace.save(options.output)
+    print(f"{len(trace)} images of {world.name} in {options.output}")
+    return 0

@@ -1,0 +1,103 @@
+"""ssh-abduction train, evaluate, recognise: the map's labels teach a recogniser, which then knows a dstate from one image."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.text import table
+from ssh_abduction.errors import MapError
+from ssh_abduction.maps import maps_of, read_json
+from ssh_abduction.trace import Trace
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = "Train a nearest-neighbour recogniser on the labels that a map gives to the images of a trace."
+    train = verbs.add_parser("train", help="train a recogniser on a map's labels", description=text)
+    train.add_argument("-o", "--output", required=True, metavar="FILE.skops", help="file to write")
+    train.set_defaults(run=run_train)
+    text = "Recognition rate by 10-fold cross-validation, against the number of images, on the labels that a map gives."
+    evaluate = verbs.add_parser("evaluate", help="learning curve of a recogniser", description=text)
+    evaluate.add_argument("--folds", type=int, default=10, help="parts of the cross-validation (default: 10)")
+    evaluate.add_argument("--seed", type=int, default=0, help="seed of the folds (default: 0)")
+    evaluate.add_argument("--plot", metavar="PNG", help="draw the learning curve")
+    evaluate.add_argument("--json", action="store_true", help="print JSON")
+    evaluate.set_defaults(run=run_evaluate)
+    for parser in (train, evaluate):
+        parser.add_argument("trace", help="trace file with images")
+        parser.add_argument("maps", help="what solve --json printed for this trace, or one saved map")
+        parser.add_argument("--map", type=int, metavar="I", help="take the I-th map, from 1 (default: the labels all maps agree on)")
+    text = "Say of each image of a trace at which dstate it was taken."
+    recognise = verbs.add_parser("recognise", help="recognise dstates from images", description=text)
+    recognise.add_argument("recogniser", help="what train wrote")
+    recognise.add_argument("trace", help="trace file with images")
+    recognise.add_argument("--json", action="store_true", help="print the labels as a JSON list")
+    recognise.set_defaults(run=run_recognise)
+
+
+def _labelled(options: argparse.Namespace) -> tuple[Any, Any]:
+    """The images of a trace and their labels, where these are sure."""
+    from perception.images import images_of
+    from ssh_abduction.learner import labels_of
+
+    trace = Trace.load(options.trace)
+    data = read_json(options.maps)
+    labels = labels_of(
+        maps_of(data, str(options.maps)),
+        None if options.map is None else options.map - 1,
+        bool(data.get("complete", True)) if isinstance(data, dict) else True,
+    )
+    if len(labels) != len(trace):
+        raise MapError(
+            f"{options.maps}: expected labels for the {len(trace)} steps of {options.trace}, got {len(labels)}; solve this trace"
+        )
+    sure = labels >= 0
+    return images_of(trace)[sure], labels[sure]
+
+
+def run_train(options: argparse.Namespace) -> int:
+    from perception.recognition import recogniser
+    from perception.store import save
+
+    images, labels = _labelled(options)
+    save(recogniser().fit(images, labels), options.output)
+    print(f"{len(set(labels.tolist()))} dstates learnt from {len(images)} images in {options.output}")
+    return 0
+
+
+def run_evaluate(options: argparse.Namespace) -> int:
+    from perception.recognition import learning_curve
+
+    images, labels = _labelled(options)
+    sizes = sorted({len(images) * tenth // 10 for tenth in range(1, 11)} - {0})
+    curve = learning_curve(images, labels, sizes, folds=options.folds, random_state=options.seed)
+    if options.json:
+        print(
+            json.dumps({"sizes": curve.sizes, "mean": curve.mean, "lowest": curve.lowest, "highest": curve.highest, "folds": curve.folds})
+        )
+    else:
+        rows = [
+            [s, f"{m:.3f}", f"{a:.3f}", f"{b:.3f}"] for s, m, a, b in zip(curve.sizes, curve.mean, curve.lowest, curve.highest, strict=True)
+        ]
+        print(table(["images", "recognised", "worst fold", "best fold"], rows))
+    if options.plot:
+        from ssh_abduction.reproduce.figures import draw_learning
+
+        draw_learning(options.plot, {"map": curve})
+    return 0
+
+
+def run_recognise(options: argparse.Namespace) -> int:
+    from perception.images import images_of
+    from perception.store import load
+
+    model = load(options.recogniser).model
+    trace = Trace.load(options.trace)
+    labels = [int(x) for x in model.predict(images_of(trace))]
+    if options.json:
+        print(json.dumps(labels))
+    else:
+        print(table(["step", "dstate"], list(enumerate(labels))))
+    return 0

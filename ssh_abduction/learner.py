@@ -1,0 +1,92 @@
+"""The bootstrap loop of Kuipers & Beeson (2002), Figure 1: images, views, map, labels, recogniser.
+
+>>> from simulator.tours import simulate
+>>> from simulator.world import World
+>>> learner = BootstrapLearner().fit(simulate(World.named("notched-rectangle"), tours=3, seed=1))
+>>> learner.clusterer_.k_, learner.solution_.cost.dstates
+(4, 8)
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from perception.images import images_of
+from perception.reciprocal import ReciprocalTransformer
+from perception.recognition import recogniser
+from perception.views import ViewClusterer
+from ssh_abduction.errors import SSHError
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver import solve
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Trace
+
+
+class LearnerError(SSHError):
+    """The loop cannot be closed: there is no map, or none of its labels is sure."""
+
+
+class AmbiguousMapWarning(UserWarning):
+    """Several minimal maps remain: only the labels that they agree on are learnt from."""
+
+
+class BootstrapLearner:
+    """Learns to recognise places from a trace of images and actions, without being told any place.
+
+    theory     which axioms; Theory.topological() by default
+    clusterer  images to views; ViewClusterer(random_state=0) by default
+    choose     index of the map to take where several remain; None takes the labels that all of them agree on
+    limit      seconds for the map
+
+    After `fit`: clusterer_, views_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree, recogniser_.
+    """
+
+    def __init__(self, theory: Theory | None = None, clusterer: Any = None, choose: int | None = None, limit: float | None = None) -> None:
+        self.theory = theory
+        self.clusterer = clusterer
+        self.choose = choose
+        self.limit = limit
+
+    def fit(self, trace: Trace) -> BootstrapLearner:
+        """Run the loop. Raises LearnerError, PerceptionError, TraceError."""
+        images = images_of(trace)
+        self.clusterer_ = self.clusterer or ViewClusterer(random_state=0)
+        self.views_ = self.clusterer_.fit(ReciprocalTransformer().fit_transform(images)).labels_
+        self.solution_ = solve(trace.with_views(self.views_.tolist()), self.theory, limit=self.limit)
+        self.labels_ = labels_of(self.solution_.maps, self.choose, self.solution_.complete)
+        self.map_ = self.solution_.maps[self.choose or 0]
+        sure = self.labels_ >= 0
+        self.recogniser_ = recogniser().fit(images[sure], self.labels_[sure])
+        return self
+
+    def predict(self, images: ArrayLike) -> NDArray[np.intp]:
+        """The dstates, ids of `map_`, at which images (m, d) were taken."""
+        return np.asarray(self.recogniser_.predict(images), np.intp)
+
+
+def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool = True) -> NDArray[np.intp]:
+    """The label of each step, (n,): the dstate in the chosen map, or in the first, with -1 where the maps disagree.
+
+    Maps agree on a step if the first step at its dstate is the same in all of them. Warns if they do not agree everywhere, or if
+    there may be more maps than these. Raises LearnerError where no map or no label is left.
+    """
+    if not maps:
+        raise LearnerError("maps: expected at least one to take labels from, got none; see the solution's status")
+    if choose is not None and not 0 <= choose < len(maps):
+        raise LearnerError(f"map: expected an index from 0 to {len(maps) - 1}, got {choose}")
+    labels = np.array(maps[choose or 0].labels, np.intp)
+    if choose is not None:
+        return labels
+    first = [np.unique(m.labels, return_index=True)[1][np.array(m.labels)] for m in maps]
+    agreed = np.all([f == first[0] for f in first], axis=0)
+    if not agreed.all() or not complete:
+        unsure = f"{len(maps)} minimal maps{'' if complete else ' or more'} remain, and agree on {agreed.sum()} of {len(agreed)} labels"
+        warnings.warn(f"{unsure}: only these are learnt from; choose a map, or explore more", AmbiguousMapWarning, stacklevel=2)
+    if not agreed.any():
+        raise LearnerError("labels: expected some that all maps agree on, got none; choose a map")
+    return np.where(agreed, labels, -1)

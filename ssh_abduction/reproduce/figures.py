@@ -1,0 +1,166 @@
+"""The figures of a reproduction, drawn from what was computed. Needs matplotlib (the extra `plot`)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.recognition import LearningCurve
+from simulator.laser import BEARINGS
+from simulator.world import World
+from ssh_abduction.errors import SSHError
+from ssh_abduction.reproduce.claims import Outcome
+
+BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"
+
+
+def _pyplot() -> Any:
+    try:
+        import matplotlib
+    except ImportError:
+        raise SSHError("plot: expected matplotlib, got none; install ssh-abduction[plot]") from None
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    pyplot.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "figure.dpi": 110})
+    return pyplot
+
+
+def _save(figure: Any, path: str | Path) -> None:
+    figure.savefig(path, bbox_inches="tight")
+    _pyplot().close(figure)
+
+
+def draw_quality(path: str | Path, quality: Mapping[int, float], uncertainty: Mapping[int, float], chosen: int) -> None:
+    """M, and U where it is known, against the number of clusters k."""
+    figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
+    axes.plot(list(quality), list(quality.values()), "o-", color=BLUE, label="M")
+    axes.axvline(chosen, color=GREY, linestyle=":", label=f"k = {chosen}")
+    axes.set(xlabel="number of clusters k", ylabel="M: separation of clusters")
+    handles = axes.get_legend_handles_labels()
+    if uncertainty:
+        right = axes.twinx()
+        right.plot(list(uncertainty), list(uncertainty.values()), "s--", color=ORANGE, label="U(v|x)")
+        right.set(ylabel="U: views determined by dstates", ylim=(min(0.7, *uncertainty.values()), 1.02))
+        right.spines["right"].set_visible(True)
+        more = right.get_legend_handles_labels()
+        handles = (handles[0] + more[0], handles[1] + more[1])
+    axes.legend(*handles, frameon=False, loc="best")
+    _save(figure, path)
+
+
+def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None:
+    """Recognition rate, mean and range over the folds, against the number of images."""
+    figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
+    for (name, curve), colour in zip(curves.items(), (BLUE, ORANGE, GREEN), strict=False):
+        axes.fill_between(curve.sizes, curve.lowest, curve.highest, color=colour, alpha=0.2, linewidth=0)
+        axes.plot(curve.sizes, curve.mean, "o-", color=colour, label=name)
+    axes.set(xlabel="images seen", ylabel="recognition rate", ylim=(0, 1.03))
+    axes.legend(frameon=False, loc="lower right")
+    _save(figure, path)
+
+
+def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]]) -> None:
+    """The walls, the clutter, the true dstates, and the poses at which images were taken."""
+    figure, axes = _pyplot().subplots(figsize=(7, 4))
+    for x1, y1, x2, y2 in world.segments:
+        axes.plot([x1, x2], [y1, y2], color="black", linewidth=1.5)
+    for item in world.clutter:
+        for x1, y1, x2, y2 in item.segments:
+            axes.plot([x1, x2], [y1, y2], color=ORANGE, linewidth=1)
+    at = np.array(poses)
+    axes.plot(at[:, 0], at[:, 1], ".", color=BLUE, markersize=3, alpha=0.5)
+    size = 0.05 * max(world.bounds[2] - world.bounds[0], world.bounds[3] - world.bounds[1])
+    for s in world.dstates:
+        x, y, heading = s.pose
+        axes.annotate(
+            "", (x + size * math.cos(heading), y + size * math.sin(heading)), (x, y), arrowprops={"arrowstyle": "->", "color": GREEN}
+        )
+        if len(world.dstates) <= 8:
+            axes.text(x + 1.35 * size * math.cos(heading), y + 1.35 * size * math.sin(heading), s.name, ha="center", va="center")
+    if len(world.dstates) > 8:
+        for place in sorted({s.place for s in world.dstates}):
+            x, y, _ = next(s.pose for s in world.dstates if s.place == place)
+            axes.text(x + 0.9 * size, y + 0.75 * size, place, ha="center")
+    axes.set(aspect="equal", xlabel="x, metres", ylabel="y, metres")
+    _save(figure, path)
+
+
+def draw_views(path: str | Path, images: NDArray[np.float64], views: NDArray[Any], truth: NDArray[Any]) -> None:
+    """The images of each view on top of each other, as the robot sees them, and which dstates they are of."""
+    names = sorted(set(views.tolist()))
+    columns = min(5, len(names))
+    rows = math.ceil(len(names) / columns)
+    figure, grid = _pyplot().subplots(rows, columns, figsize=(2.1 * columns, 2.0 * rows), squeeze=False)
+    for axes in grid.flat:
+        axes.axis("off")
+    far = min(8.4, 1.05 * float(np.percentile(images, 98)))
+    for axes, name in zip(grid.flat, names, strict=False):
+        for image in images[views == name][:60]:
+            axes.plot(-image * np.sin(BEARINGS), image * np.cos(BEARINGS), color=BLUE, linewidth=0.4, alpha=0.3)
+        axes.plot(0, 0, "^", color=ORANGE, markersize=5)
+        axes.set(aspect="equal", xlim=(-far, far), ylim=(-0.06 * far, far))
+        dstates = sorted(set(truth[views == name].tolist()))
+        shown = ", ".join(dstates) if len(dstates) < 3 else f"{dstates[0]}, … ({len(dstates)})"
+        axes.set_title(f"view {name}: {shown}", fontsize=7)
+    _save(figure, path)
+
+
+def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
+    """The largest offset from a dstate, tour by tour."""
+    table = np.array(spread)
+    figure, axes = _pyplot().subplots(figsize=(5.5, 2.8))
+    axes.plot(np.arange(1, len(table) + 1), 1000 * table[:, :2].max(1), "o-", color=BLUE, markersize=3, label="position")
+    axes.set(xlabel="tour", ylabel="largest offset, mm", ylim=(0, None))
+    right = axes.twinx()
+    right.plot(np.arange(1, len(table) + 1), np.degrees(table[:, 2]), "s--", color=ORANGE, markersize=3, label="heading")
+    right.set(ylabel="largest offset, degrees", ylim=(0, None))
+    right.spines["right"].set_visible(True)
+    figure.legend(frameon=False, loc="upper right", ncols=2)
+    _save(figure, path)
+
+
+def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[float, float]) -> None:
+    """k, U, map and recognition rate over notch and spread. Frames mark where all is as in the paper; the cross is this world and robot."""
+    notches = sorted({o.notch for o in outcomes})
+    scales = sorted({o.scale for o in outcomes})
+    cell = {(o.notch, o.scale): o for o in outcomes}
+    spreads = [float(np.mean([cell[n, t].spread for n in notches])) for t in scales]
+    pyplot: Any = _pyplot()
+    figure, grid = pyplot.subplots(2, 2, figsize=(9, 6.4))
+    panels: list[tuple[str, Callable[[Outcome], float], str]] = [
+        ("k chosen by M", lambda o: o.k, "viridis"),
+        ("U at that k", lambda o: o.uncertainty, "viridis"),
+        ("map right", lambda o: float(o.right), "Greens"),
+        ("recognition rate (true labels)", lambda o: o.rate, "viridis"),
+    ]
+    for axes, (title, value, colours) in zip(grid.flat, panels, strict=True):
+        table = np.array([[value(cell[n, t]) for t in scales] for n in notches])
+        lowest = {"map right": 0.0, "U at that k": 0.7, "recognition rate (true labels)": 0.4, "k chosen by M": 2}
+        axes.imshow(table, origin="lower", cmap=colours, aspect="auto", vmin=lowest[title])
+        for i, n in enumerate(notches):
+            for j, t in enumerate(scales):
+                o = cell[n, t]
+                text = {"k chosen by M": str(o.k), "map right": "yes" if o.right else "no"}.get(title, f"{table[i, j]:.2f}")
+                middle = (table.min() + table.max()) / 2
+                dark = table[i, j] <= middle if colours == "viridis" else table[i, j] > middle
+                axes.text(j, i, text, ha="center", va="center", fontsize=8, color="white" if dark else "black")
+                if as_in_paper(o):
+                    axes.add_patch(pyplot.Rectangle((j - 0.47, i - 0.47), 0.94, 0.94, fill=False, edgecolor=ORANGE, linewidth=2))
+        x, y = np.interp(here[1], scales, range(len(scales))), np.interp(here[0], notches, range(len(notches)))
+        axes.plot(x, y, "x", color="red", markersize=10, markeredgewidth=2.5)
+        axes.set_xticks(range(len(scales)), [f"{1000 * s:.1f}" for s in spreads])
+        axes.set_yticks(range(len(notches)), [f"{100 * n:g}" for n in notches])
+        axes.set(title=title, xlabel="spread of positions (rms), mm", ylabel="depth of the notch, cm")
+    figure.tight_layout()
+    _save(figure, path)
+
+
+def as_in_paper(o: Outcome) -> bool:
+    """Four views, U = 1, the right map, and full recognition."""
+    return o.k == 4 and o.uncertainty > 1 - 1e-9 and o.right and o.rate > 0.999

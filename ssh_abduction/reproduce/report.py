@@ -1,0 +1,165 @@
+"""A reproduction as a folder: figures, one page, the data, and what made them."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from html import escape
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from joblib import Parallel, delayed
+
+from perception.images import images_of
+from simulator.control import STILL, Tolerance
+from simulator.laser import Laser
+from simulator.robot import Body
+from simulator.tours import simulate
+from simulator.world import World
+from ssh_abduction.errors import SSHError
+from ssh_abduction.learner import BootstrapLearner
+from ssh_abduction.picture import svg
+from ssh_abduction.reproduce import figures
+from ssh_abduction.reproduce.claims import EXPERIMENTS, VIEWS_ALONE, WITH_STARS, Run, measure, outcome, summary, to_dict, true_dstates
+
+NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)  # metres
+SCALES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # times the spread that hill-climbing leaves
+
+
+def reproduce(
+    name: str, seeds: Sequence[int], folder: Path, jobs: int = 2, outcomes: bool = True, on_done: Callable[[str], None] = lambda _: None
+) -> list[dict[str, Any]]:
+    """Run an experiment for all seeds, and write everything into a folder. Returns the table of claims. Raises SSHError."""
+    if name not in EXPERIMENTS:
+        raise SSHError(f"experiment: expected one of {', '.join(EXPERIMENTS)}, got {name!r}")
+    if not seeds:
+        raise SSHError("seeds: expected at least one, got none; write 0-19")
+    folder.mkdir(parents=True, exist_ok=True)
+    runs: list[Run] = []
+    for run in Parallel(n_jobs=jobs, return_as="generator")(delayed(measure)(name, seed) for seed in seeds):
+        runs.append(run)
+        on_done(f"seed {run.seed}")
+    table = summary(name, runs)
+    _draw(name, runs[0], folder, on_done)
+    if outcomes and name == "notched-rectangle":
+        grid = [(notch, scale) for notch in NOTCHES for scale in SCALES]
+        found = []
+        for o in Parallel(n_jobs=jobs, return_as="generator")(delayed(outcome)(notch, scale) for notch, scale in grid):
+            found.append(o)
+            on_done(f"notch {100 * o.notch:g} cm, spread {1000 * o.spread:.1f} mm")
+        depth = -float(World.named(EXPERIMENTS[name].world).segments[:, 1::2].min())
+        figures.draw_outcomes(folder / "outcomes.png", found, (depth, 1.0))
+        _dump(folder / "outcomes.json", [asdict(o) for o in found])
+    _dump(folder / "claims.json", table)
+    _dump(folder / "runs.json", [to_dict(run) for run in runs])
+    _dump(folder / "configuration.json", _configuration(name, seeds, outcomes))
+    (folder / "report.html").write_text(_page(name, runs, table, folder), encoding="utf-8")
+    return table
+
+
+def steps(name: str, seeds: Sequence[int], outcomes: bool) -> int:
+    """How often `on_done` will be called: for a progress bar."""
+    return len(seeds) + 1 + (len(NOTCHES) * len(SCALES) if outcomes and name == "notched-rectangle" else 0)
+
+
+def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> None:
+    e = EXPERIMENTS[name]
+    world = World.named(e.world)
+    trace = simulate(world, e.tours, run.seed)
+    trace.save(folder / "run.jsonl")
+    learner = BootstrapLearner(VIEWS_ALONE).fit(trace)
+    figures.draw_world(folder / "world.png", world, [step.truth["pose"] for step in trace.steps])
+    figures.draw_views(folder / "views.png", images_of(trace), learner.views_, true_dstates(trace))
+    figures.draw_quality(folder / "quality.png", run.quality, run.uncertainty, run.k)
+    figures.draw_learning(folder / "learning.png", {"labels from the map": run.curve})
+    figures.draw_spread(folder / "spread.png", run.spread)
+    starred = BootstrapLearner(WITH_STARS).fit(trace)
+    (folder / "map.svg").write_text(svg(learner.map_) + "\n", encoding="utf-8")
+    (folder / "map-with-openings.svg").write_text(svg(starred.map_) + "\n", encoding="utf-8")
+    on_done("figures")
+
+
+def _configuration(name: str, seeds: Sequence[int], outcomes: bool) -> dict[str, Any]:
+    packages = ("ssh-abduction", "clingo", "numpy", "scipy", "scikit-learn", "networkx")
+    return {
+        "experiment": name,
+        "command": f"ssh-abduction reproduce {name} --seeds {','.join(map(str, seeds))}{'' if outcomes else ' --no-outcomes'}",
+        **asdict(EXPERIMENTS[name]),
+        "seeds": list(seeds),
+        "laser": asdict(Laser()),
+        "robot": asdict(Body()),
+        "hill-climbing": {**asdict(Tolerance()), "images at rest": STILL},
+        "theory": {"views alone": VIEWS_ALONE.to_dict(), "with openings": WITH_STARS.to_dict()},
+        "versions": {"python": platform.python_version(), **{p: version(p) for p in packages}},
+        "platform": sys.platform,
+    }
+
+
+def _dump(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+FIGURES = {
+    "notched-rectangle": [
+        ("world.png", "The notched rectangle (the paper's Figure 2): walls, true dstates (arrows) and where images were taken."),
+        ("views.png", "The views: images of each cluster on top of each other, the robot at the triangle, facing up."),
+        ("quality.png", "M and U against the number of clusters (the paper's Figure 3)."),
+        ("map.svg", "The minimal map, from the views alone."),
+        ("learning.png", "Recognition rate on the map's labels, mean and range over ten folds (the paper's Figure 4)."),
+        ("spread.png", "Errors do not add up: the largest offset from a dstate's mean pose, tour by tour."),
+        (
+            "outcomes.png",
+            "Where the method works. Frames: all as in the paper (4 views, U = 1, right map, full recognition). Cross: this robot.",
+        ),
+    ],
+    "taylor-hall": [
+        ("world.png", "The hallway (the paper's Figure 5): walls, clutter (orange), true dstates (arrows) and where images were taken."),
+        ("views.png", "The views: images of each cluster on top of each other, the robot at the triangle, facing up."),
+        ("quality.png", "M and U against the number of clusters (the paper's Figure 6)."),
+        ("map.svg", "The minimal map, from the views alone."),
+        ("map-with-openings.svg", "The minimal map when the openings that the robot saw at each place are used too."),
+        ("learning.png", "Recognition rate on the map's labels, mean and range over ten folds (the paper's Figure 6)."),
+        ("spread.png", "Errors do not add up: the largest offset from a dstate's mean pose, tour by tour."),
+    ],
+}
+
+
+def _page(name: str, runs: Sequence[Run], table: Sequence[dict[str, Any]], folder: Path) -> str:
+    rows = "\n".join(
+        f"<tr><td>{escape(row['claim'])}</td><td>{escape(row['paper'])}</td><td>{escape(spread_of(row))}</td>"
+        f"<td>{row['holds']} of {row['seeds']}</td></tr>"
+        for row in table
+    )
+    shown = "\n".join(
+        f'<figure><img src="{file}" alt="{escape(text)}"><figcaption>{escape(text)}</figcaption></figure>'
+        for file, text in FIGURES[name]
+        if (folder / file).exists()
+    )
+    title = World.named(EXPERIMENTS[name].world).name
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>Bootstrap learning: {escape(title)}</title>
+<style>body{{font:15px/1.5 Helvetica,Arial,sans-serif;max-width:60em;margin:2em auto;padding:0 1em;color:#222}}
+table{{border-collapse:collapse}}td,th{{padding:.25em .8em;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}}
+figure{{display:inline-block;margin:1em 1em 1em 0;vertical-align:top;max-width:28em}}img{{max-width:100%}}figcaption{{font-size:13px;color:#555}}</style></head>
+<body><h1>{escape(title)}: claim, paper, here</h1>
+<p>Kuipers &amp; Beeson, “Bootstrap Learning for Place Recognition”, AAAI 2002. {len(runs)} seeds; figures are of seed {runs[0].seed}.
+The world, the robot and its laser were fixed before the seeds were run. All can be made again: <code>configuration.json</code> says with what.</p>
+<table><tr><th>claim</th><th>paper</th><th>here</th><th>holds in seeds</th></tr>
+{rows}
+</table>
+{shown}
+</body></html>
+"""
+
+
+def spread_of(row: dict[str, Any]) -> str:
+    """Our figure: one text where the seeds agree, else the commonest texts."""
+    values = list(row["here"].values())
+    counted = sorted(set(values), key=values.count, reverse=True)
+    if len(counted) == 1:
+        return str(counted[0])
+    return "; ".join(f"{v} (x{values.count(v)})" for v in counted[:3]) + ("; …" if len(counted) > 3 else "")

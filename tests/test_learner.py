@@ -1,0 +1,269 @@
+"""The bootstrap loop: from a simulated robot to a recogniser, in Python and in the shell."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.errors import ImageWarning, PerceptionError
+from perception.images import images_of
+from perception.views import ViewClusterer
+from simulator.tours import simulate
+from simulator.world import World
+from ssh_abduction import Step, Theory, Trace, solve
+from ssh_abduction import learner as learner_module
+from ssh_abduction.checker import check
+from ssh_abduction.cli import main
+from ssh_abduction.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, labels_of
+from ssh_abduction.reproduce.claims import EXPERIMENTS, claims, one_to_one, outcome, rate, summary, true_dstates
+
+VIEWS_ALONE = Theory.topological().replace(star="none")
+
+
+@pytest.fixture(scope="module")
+def run() -> Trace:
+    return simulate(World.named("notched-rectangle"), tours=12, seed=500)
+
+
+@pytest.fixture(scope="module")
+def hall() -> Trace:
+    return simulate(World.named("taylor-hall"), tours=3, seed=500)
+
+
+def test_the_notched_rectangle_is_learnt_from_its_images_alone(run: Trace) -> None:
+    learner = BootstrapLearner(VIEWS_ALONE).fit(run)
+    assert learner.clusterer_.k_ == 4
+    assert learner.views_[0] == learner.views_[4]
+    assert learner.labels_[0] != learner.labels_[4]
+    assert (len(learner.map_.dstates), len(learner.map_.places), len(learner.map_.paths)) == (8, 4, 4)
+    assert one_to_one(learner.labels_, true_dstates(run))
+    assert check(run.with_views(learner.views_.tolist()), learner.map_, VIEWS_ALONE) == ()
+    again = simulate(World.named("notched-rectangle"), tours=3, seed=501)
+    meaning = dict(zip(true_dstates(run), learner.labels_, strict=True))
+    recognised = learner.predict(images_of(again)) == [meaning[name] for name in true_dstates(again)]
+    assert recognised.mean() > 0.9
+
+
+def test_the_hall_is_learnt_with_the_openings_seen(hall: Trace) -> None:
+    learner = BootstrapLearner().fit(hall)
+    assert learner.clusterer_.k_ == 10
+    assert (len(learner.map_.dstates), len(learner.map_.places), len(learner.map_.paths)) == (20, 7, 4)
+    assert one_to_one(learner.labels_, true_dstates(hall))
+
+
+def test_the_loop_fits_on_one_screen() -> None:
+    assert len(inspect.getsource(learner_module).splitlines()) < 110
+    assert len(inspect.getsource(BootstrapLearner.fit).splitlines()) < 15
+
+
+def test_learning_reads_no_truth(run: Trace) -> None:
+    bare = replace(run, steps=tuple(replace(step, truth=None) for step in run.steps))
+    with_truth, without = (BootstrapLearner(VIEWS_ALONE).fit(trace) for trace in (run, bare))
+    np.testing.assert_array_equal(with_truth.labels_, without.labels_)
+    assert with_truth.map_ == without.map_
+
+
+def test_where_maps_disagree_nothing_is_learnt_unless_one_is_chosen() -> None:
+    trace = Trace.from_steps("abbab", ["travel", "around", "right", "right"])
+    solution = solve(trace, VIEWS_ALONE, maps=0)
+    assert solution.count > 1
+    with pytest.warns(AmbiguousMapWarning, match=f"{solution.count} minimal maps remain, and agree on"):
+        labels = labels_of(solution.maps)
+    assert labels.tolist() == [0, 1, 2, 3, -1]
+    for t in np.flatnonzero(labels >= 0):
+        assert len({m.labels.index(m.labels[t]) for m in solution.maps}) == 1
+    for i, ssh_map in enumerate(solution.maps):
+        assert labels_of(solution.maps, choose=i).tolist() == list(ssh_map.labels)
+    with pytest.raises(LearnerError, match="expected an index from 0"):
+        labels_of(solution.maps, choose=99)
+    with pytest.raises(LearnerError, match="expected at least one"):
+        labels_of([])
+
+
+def test_an_incomplete_list_of_maps_is_said() -> None:
+    maps = solve(Trace.from_steps("aba", ["travel", "travel"])).maps
+    with pytest.warns(AmbiguousMapWarning, match="1 minimal maps or more remain"):
+        labels_of(maps, complete=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        labels_of(maps)
+
+
+def test_other_clusterings_can_be_plugged_in(run: Trace) -> None:
+    from sklearn.cluster import AgglomerativeClustering
+
+    clusterer = ViewClusterer(clusterer=AgglomerativeClustering(linkage="complete"), k_max=10)
+    assert one_to_one(BootstrapLearner(VIEWS_ALONE, clusterer).fit(run).labels_, true_dstates(run))
+
+
+# Images
+
+
+def test_images_from_a_sidecar_file(run: Trace, tmp_path: Path) -> None:
+    table = images_of(run)
+    indexed = replace(run, images="scans.npz", steps=tuple(replace(step, image=i) for i, step in enumerate(run.steps)))
+    indexed.save(tmp_path / "run.jsonl")
+    np.savez(tmp_path / "scans.npz", images=table)
+    np.testing.assert_array_equal(images_of(Trace.load(tmp_path / "run.jsonl")), table)
+    np.savez(tmp_path / "scans.npz", images=table[:3])
+    with pytest.raises(PerceptionError, match="expected an index below 3, got 3"):
+        images_of(Trace.load(tmp_path / "run.jsonl"))
+    (tmp_path / "scans.npz").write_bytes(b"PK\x03\x04 cut in the middle")
+    with pytest.raises(PerceptionError, match=r"scans\.npz: expected a \.npy or \.npz file"):
+        images_of(Trace.load(tmp_path / "run.jsonl"))
+    (tmp_path / "scans.npz").unlink()
+    with pytest.raises(PerceptionError, match=r"scans\.npz: expected a \.npy or \.npz file"):
+        images_of(Trace.load(tmp_path / "run.jsonl"))
+
+
+def test_images_that_cannot_be_a_table() -> None:
+    uneven = Trace((Step(image=(1.0, 2.0), action=None),))
+    steps = (replace(uneven.steps[0], action=Trace.from_steps("ab", ["travel"]).actions[0]), Step(image=(1.0,)))
+    with pytest.raises(PerceptionError, match="step 1: image: expected 2 ranges, as the first has, got 1"):
+        images_of(Trace(steps))
+    with pytest.raises(PerceptionError, match="step 0: image: expected one, got none"):
+        images_of(Trace.from_steps("ab", ["travel"]))
+    with pytest.raises(PerceptionError, match="expected the header to name a file"):
+        images_of(Trace((Step(image=3),)))
+
+
+def test_poor_images_are_counted_or_refused() -> None:
+    action = Trace.from_steps("ab", ["travel"]).actions[0]
+
+    def trace_of(*images: tuple[float, ...]) -> Trace:
+        return Trace(tuple(Step(image=image, action=action if i < len(images) - 1 else None) for i, image in enumerate(images)))
+
+    with pytest.warns(ImageWarning, match="2 of 12 ranges were replaced"):
+        BootstrapLearner(Theory.causal()).fit(trace_of((1.0, 0.0, 2.0), (1.0, 1.0, 2.0), (3.0, 1.0, 0.0), (3.0, 1.1, 1.0)))
+    with pytest.warns(ImageWarning, match="images are equal"):
+        assert BootstrapLearner(Theory.causal()).fit(trace_of((1.0, 2.0), (1.0, 2.0), (1.0, 2.0))).views_.tolist() == [0, 0, 0]
+    with pytest.raises(ValueError, match="minimum of 2"):
+        BootstrapLearner(Theory.causal()).fit(trace_of((1.0, 2.0)))
+
+
+# Claims
+
+
+def test_the_claims_are_those_of_the_paper() -> None:
+    for name, e in EXPERIMENTS.items():
+        papers = [claim.paper for claim in claims(name)]
+        assert str(e.views) in papers
+        assert f"{e.dstates}, {e.places}, {e.paths}" in papers
+        assert "100 %" in papers
+
+
+def test_recognition_by_poor_labels_is_poor(run: Trace) -> None:
+    truth = true_dstates(run)
+    images = 1 / images_of(run)
+    codes = np.unique(truth, return_inverse=True)[1]
+    assert rate(images, codes, truth, 0) > 0.95
+    assert rate(images, codes % 4, truth, 0) == pytest.approx(0.5, abs=0.1)
+    assert rate(images, np.zeros_like(codes), truth, 0) == pytest.approx(1 / 8, abs=0.05)
+
+
+def test_outcomes_differ_over_notch_and_spread() -> None:
+    good, blurred, bare = outcome(0.03, 0.5), outcome(0.03, 8), outcome(0.0, 0.5)
+    assert (good.k, good.right) == (4, True)
+    assert good.rate > 0.99
+    assert blurred.rate < good.rate
+    assert bare.rate < 0.7  # without a notch nothing tells opposite corners apart
+    assert (bare.k, bare.right) == (4, True)
+
+
+# The shell
+
+
+def test_from_simulation_to_recognition_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def path(name: str) -> str:
+        return str(tmp_path / name)
+
+    assert main(["simulate", "notched-rectangle", "--tours", "10", "--seed", "3", "-o", path("run.jsonl")]) == 0
+    assert "80 images of notched rectangle" in capsys.readouterr().out
+    assert main(["cluster", path("run.jsonl"), "-o", path("views.jsonl"), "--k-max", "8", "--plot", path("fig.png")]) == 0
+    out = capsys.readouterr().out
+    assert "4 views of 80 images" in out
+    assert out.splitlines()[0].split() == ["k", "M", "U"]
+    assert (tmp_path / "fig.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["solve", path("views.jsonl"), "--json"]) == 0
+    (tmp_path / "maps.json").write_text(capsys.readouterr().out)
+    assert main(["train", path("views.jsonl"), path("maps.json"), "-o", path("recogniser.skops")]) == 0
+    assert "8 dstates learnt from 80 images" in capsys.readouterr().out
+    assert main(["evaluate", path("views.jsonl"), path("maps.json"), "--json", "--plot", path("curve.png")]) == 0
+    curve = json.loads(capsys.readouterr().out)
+    assert curve["sizes"][-1] == 80
+    assert curve["mean"][-1] > 0.8
+    assert main(["evaluate", path("views.jsonl"), path("maps.json")]) == 0
+    assert capsys.readouterr().out.splitlines()[0].split() == ["images", "recognised", "worst", "fold", "best", "fold"]
+    assert main(["simulate", "notched-rectangle", "--tours", "2", "--seed", "4", "-o", path("other.jsonl")]) == 0
+    capsys.readouterr()
+    assert main(["recognise", path("recogniser.skops"), path("other.jsonl"), "--json"]) == 0
+    labels = json.loads(capsys.readouterr().out)
+    assert np.mean(np.array(labels) == [i % 8 for i in range(16)]) > 0.8
+    assert main(["recognise", path("recogniser.skops"), path("other.jsonl")]) == 0
+    assert capsys.readouterr().out.splitlines()[0].split() == ["step", "dstate"]
+
+
+def test_errors_of_the_wings_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trace = tmp_path / "t.jsonl"
+    Trace.from_steps("ab", ["travel"]).save(trace)
+    (tmp_path / "cut.skops").write_bytes(b"PK\x03\x04")
+    (tmp_path / "maps.json").write_text(json.dumps(solve(Trace.from_steps("a", [])).maps[0].to_dict()))
+    for words, message in [
+        (["simulate", "atlantis", "-o", str(tmp_path / "x")], "world: expected one of notched-rectangle, taylor-hall"),
+        (["simulate", "notched-rectangle", "--tours", "0", "-o", str(tmp_path / "x")], "tours: expected 1 or more"),
+        (["simulate", "notched-rectangle", "--route", "travel,travel", "-o", str(tmp_path / "x")], "expected a free way ahead, got a wall"),
+        (["cluster", str(trace), "-o", str(tmp_path / "x")], "image: expected one, got none"),
+        (["train", str(trace), str(tmp_path / "maps.json"), "-o", str(tmp_path / "x")], "expected labels for the 2 steps"),
+        (["recognise", str(tmp_path / "cut.skops"), str(trace)], "expected a .skops file"),
+        (["reproduce", "taylor-hall", "--seeds", "x"], "--seeds: expected numbers"),
+    ]:
+        assert main(words) == 1, words
+        captured = capsys.readouterr()
+        assert message in captured.err
+        assert captured.err.count("\n") == 1
+        assert captured.out == ""
+
+
+def test_reproduce_writes_the_page_and_all_that_made_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With few circuits, so that it is quick; the claims themselves are measured by `reproduce`, over 20 seeds."""
+    small = replace(EXPERIMENTS["notched-rectangle"], tours=12, k_max=8)
+    monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", small)
+    words = ["reproduce", "notched-rectangle", "--seeds", "500", "--jobs", "1", "--no-outcomes", "-o", str(tmp_path)]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "k chosen by M" in out
+    assert "report.html" in out
+    made = {p.name for p in tmp_path.iterdir()}
+    assert {"report.html", "claims.json", "runs.json", "configuration.json", "run.jsonl", "world.png", "views.png", "quality.png"} <= made
+    assert {"learning.png", "spread.png", "map.svg"} <= made
+    page = (tmp_path / "report.html").read_text()
+    for name in ("world.png", "learning.png", "map.svg"):
+        assert f'src="{name}"' in page
+    configuration = json.loads((tmp_path / "configuration.json").read_text())
+    assert configuration["seeds"] == [500]
+    assert configuration["versions"]["clingo"]
+    claimed = json.loads((tmp_path / "claims.json").read_text())
+    assert all(row["seeds"] == 1 for row in claimed)
+    assert main([*words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["claims"] == claimed
+
+
+def test_a_summary_counts_the_seeds_in_which_a_claim_holds() -> None:
+    from ssh_abduction.reproduce.claims import measure
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(EXPERIMENTS, "notched-rectangle", replace(EXPERIMENTS["notched-rectangle"], tours=12, k_max=8))
+        good = measure("notched-rectangle", 500)
+    bad = replace(good, seed=1, k=5, uncertainty={**good.uncertainty, 5: 0.9}, cost={"dstates": 9, "places": 4, "paths": 4}, right=False)
+    table = {row["claim"]: row for row in summary("notched-rectangle", [good, bad])}
+    assert table["U at that k"]["holds"] == 1
+    assert table["dstates, places, paths, from the views alone"]["here"] == {"500": "8, 4, 4", "1": "9, 4, 4"}
+    assert table["labels from the views alone are the true dstates"]["holds"] == 1

@@ -1,0 +1,508 @@
+"""Images to views to a recogniser: against independent computations, scikit-learn's own checks, poor images and hostile files."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import pickle
+import subprocess
+import sys
+import tracemalloc
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import skops.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial.distance import pdist, squareform
+from sklearn.base import clone
+from sklearn.cluster import DBSCAN, AgglomerativeClustering, KMeans, MeanShift
+from sklearn.metrics import adjusted_rand_score, mutual_info_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer
+from sklearn.utils.estimator_checks import parametrize_with_checks
+
+from perception import quality, store, views
+from perception.errors import ImageWarning, PerceptionError
+from perception.quality import cluster_quality, cluster_spread, spanning_tree, uncertainty_coefficient
+from perception.reciprocal import ReciprocalTransformer
+from perception.recognition import PlaceRecognizer, learning_curve, recogniser
+from perception.views import ViewClusterer
+from ssh_abduction.errors import SSHError
+
+Images = np.ndarray[Any, Any]
+
+
+def blobs(clusters: int, each: int, beams: int = 8, spread: float = 0.1, seed: int = 0) -> tuple[Images, Images]:
+    """Images around well separated centres, and the number of the centre of each."""
+    rng = np.random.default_rng(seed)
+    centres = 3 * np.eye(max(beams, clusters))[:clusters, :beams] + np.arange(clusters)[:, None]
+    truth = np.arange(clusters * each) % clusters
+    return centres[truth] + rng.normal(0, spread, (len(truth), beams)), truth
+
+
+def plain_quality(images: Images, labels: Images) -> float:
+    """M from all pairs at once."""
+    distances, same = squareform(pdist(images)), labels[:, None] == labels
+    return float(distances[~same].min() / distances[same].max())
+
+
+@parametrize_with_checks(
+    [
+        ReciprocalTransformer(),
+        PlaceRecognizer(),
+        ViewClusterer(n_init=1, k_max=6),
+        ViewClusterer(k=3, n_init=1),
+        ViewClusterer(clusterer=AgglomerativeClustering(), k_max=6),
+        ViewClusterer(clusterer=DBSCAN(eps=1.0)),
+    ]
+)
+@pytest.mark.filterwarnings("ignore")
+def test_estimators_keep_the_rules_of_scikit_learn(estimator: Any, check: Any) -> None:
+    check(estimator)
+
+
+# reciprocals
+
+
+def test_reciprocals_are_of_metres_and_clipped_at_the_floor() -> None:
+    assert ReciprocalTransformer(0.1).fit_transform([[0.5, 0.05, 4.0]]).tolist() == [[2, 10, 0.25]]
+
+
+def test_what_is_no_range_is_replaced_and_counted_once() -> None:
+    images = [[np.inf, np.nan, np.inf], [0.0, -1.0, -np.inf]]
+    transformer = ReciprocalTransformer(0.5).fit(images)
+    with pytest.warns(ImageWarning, match=r"6 of 6 ranges were replaced: 2 infinite and 1 missing.*3 of zero or less") as caught:
+        assert transformer.transform(images).tolist() == [[0, 0, 0], [2, 2, 2]]
+    assert len(caught) == 1
+
+
+@pytest.mark.parametrize("floor", [0, -1, np.inf, np.nan, "near"])
+def test_a_floor_is_a_positive_number(floor: Any) -> None:
+    with pytest.raises(PerceptionError, match="floor: expected a positive number"):
+        ReciprocalTransformer(floor).fit([[1.0]])
+
+
+@pytest.mark.parametrize("estimator", [ReciprocalTransformer(), ViewClusterer()])
+def test_images_of_unequal_length_are_named(estimator: Any) -> None:
+    with pytest.raises(PerceptionError, match="image 2: expected 2 ranges, as image 0 has, got 3"):
+        estimator.fit([[1.0, 2.0], [1.0, 3.0], [1.0, 2.0, 3.0]])
+
+
+def test_errors_of_perception_are_the_packages() -> None:
+    assert issubclass(PerceptionError, SSHError)
+
+
+# M
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 60), st.integers(1, 6), st.integers(2, 5), st.sampled_from(["normal", "grid", "offset"]))
+def test_quality_is_the_ratio_over_all_pairs(seed: int, count: int, beams: int, clusters: int, kind: str) -> None:
+    rng = np.random.default_rng(seed)
+    images = rng.normal(size=(count, beams)) if kind != "grid" else rng.integers(0, 4, (count, beams)).astype(float)
+    images = images + 1e5 if kind == "offset" else images
+    labels = rng.integers(clusters, size=count)
+    distances, same = squareform(pdist(images)), labels[:, None] == labels
+    if same.all():
+        expected = math.nan
+    elif distances[~same].min() == 0:
+        expected = 0.0
+    else:
+        expected = distances[~same].min() / distances[same].max() if distances[same].max() > 0 else math.inf
+    assert cluster_quality(images, labels) == pytest.approx(expected, rel=1e-9, nan_ok=True)
+    assert cluster_quality(images, labels, spanning_tree(images)) == pytest.approx(expected, rel=1e-9, nan_ok=True)
+
+
+@pytest.mark.parametrize(("cell", "block"), [(2, 3), (7, 16), (quality.CELL, quality.BLOCK)])
+@pytest.mark.parametrize("scale", [1e-120, 1.0, 1e120])
+def test_cells_and_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch, cell: int, block: int, scale: float) -> None:
+    monkeypatch.setattr(quality, "CELL", cell)
+    monkeypatch.setattr(quality, "BLOCK", block)
+    images = blobs(5, 60, beams=20, spread=0.5)[0] * scale
+    tree, labels = spanning_tree(images), np.random.default_rng(1).integers(4, size=300)
+    shortest = minimum_spanning_tree(squareform(pdist(images / scale))).sum()  # scipy takes tiny lengths for no edge
+    assert tree.lengths.sum() == pytest.approx(scale * shortest, rel=1e-12, abs=0)
+    assert cluster_quality(images, labels) == pytest.approx(plain_quality(images, labels), rel=1e-12, abs=0)
+    assert cluster_quality(images, labels, tree) == pytest.approx(plain_quality(images, labels), rel=1e-12, abs=0)
+
+
+def test_near_images_far_from_others_are_compared_exactly() -> None:
+    # Squared distances of 1e-14 beside norms of 1e6 drown in the rounding of |a|² + |b|² - 2ab.
+    rng = np.random.default_rng(0)
+    images = np.concatenate([1e3 + 1e-7 * rng.normal(size=(40, 12)), -1e3 + 1e-7 * rng.normal(size=(40, 12))])
+    tree, labels = spanning_tree(images), rng.integers(3, size=80)
+    assert np.allclose(tree.lengths, np.sort(minimum_spanning_tree(squareform(pdist(images))).data), rtol=1e-9, atol=0)
+    assert tree.separation(labels) == pytest.approx(squareform(pdist(images))[labels[:, None] != labels].min(), rel=1e-9, abs=0)
+    assert cluster_spread(images, np.arange(80) // 40) == pytest.approx(
+        max(pdist(images[:40]).max(), pdist(images[40:]).max()), rel=1e-9, abs=0
+    )
+
+
+def test_a_tree_serves_every_labeling() -> None:
+    images = np.random.default_rng(0).normal(size=(700, 9))
+    tree = spanning_tree(images)
+    for k in (2, 5, 30):
+        labels = KMeans(k, n_init=1, random_state=0).fit(images).labels_
+        assert cluster_quality(images, labels, tree) == pytest.approx(plain_quality(images, labels), rel=1e-12, abs=0)
+
+
+def test_quality_where_it_degenerates() -> None:
+    images = np.array([[0.0], [0.0], [1.0]])
+    assert math.isnan(cluster_quality(images, [0, 0, 0]))
+    assert cluster_quality(images, [0, 0, 1]) == math.inf
+    assert cluster_quality(images, [0, 1, 1]) == 0
+    assert cluster_quality(np.ones((4, 3)), [0, 1, 0, 1]) == 0
+    assert cluster_quality(images, ["a", "a", "b"]) == math.inf
+    assert spanning_tree(images).distinct == 2
+    assert spanning_tree([[1.0, 2.0]]).distinct == 1
+
+
+def test_many_equal_images_are_no_burden() -> None:
+    images = np.repeat(np.random.default_rng(0).normal(size=(3, 5)), 1_000, axis=0)
+    assert spanning_tree(images).distinct == 3
+    assert cluster_quality(images, np.arange(3_000) // 1_000) == math.inf
+
+
+@pytest.mark.parametrize("labels", [[0, 1], [[0], [1], [1]], []])
+def test_labels_are_one_an_image(labels: Any) -> None:
+    with pytest.raises(PerceptionError, match="labels: expected a row of 3 labels"):
+        cluster_quality([[0.0], [1.0], [2.0]], labels)
+
+
+def test_quality_of_images_that_are_not_finite_is_refused() -> None:
+    with pytest.raises(ValueError, match="infinity"):
+        cluster_quality([[0.0], [np.inf]], [0, 1])
+
+
+def test_memory_is_that_of_blocks_not_of_all_pairs() -> None:
+    images = np.random.default_rng(0).normal(size=(6_000, 4)) + 10 * (np.arange(6_000) % 2)[:, None]
+    tracemalloc.start()
+    cluster_quality(images, np.arange(6_000) % 2)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100 * 2**20 < 6_000**2 * 8
+
+
+# U
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 3), st.sampled_from("abcd")), min_size=1, max_size=40))
+def test_uncertainty_is_information_over_entropy(pairs: list[tuple[int, str]]) -> None:
+    seen, truth = zip(*pairs, strict=True)
+    shares = np.unique(seen, return_counts=True)[1] / len(seen)
+    entropy = -(shares * np.log(shares)).sum()
+    expected = mutual_info_score(seen, truth) / entropy if len(shares) > 1 else 1.0
+    assert uncertainty_coefficient(seen, truth) == pytest.approx(expected, abs=1e-9)
+
+
+def test_uncertainty_forgives_aliasing_and_not_variability() -> None:
+    assert uncertainty_coefficient([0, 0, 1, 1], ["a", "b", "c", "c"]) == pytest.approx(1)
+    assert uncertainty_coefficient([0, 1, 0, 1], ["a", "a", "b", "b"]) == pytest.approx(0)
+    with pytest.raises(PerceptionError, match="truth: expected 2 states, one a view, got 1"):
+        uncertainty_coefficient([0, 1], ["a"])
+
+
+# views
+
+
+def test_k_is_where_the_quality_peaks() -> None:
+    images, truth = blobs(5, 20)
+    found = ViewClusterer(random_state=0).fit(images)
+    assert found.k_ == 5
+    assert adjusted_rand_score(truth, found.labels_) == 1
+    assert list(found.quality_) == list(range(2, 21))
+    assert found.quality_[5] == max(found.quality_.values()) == pytest.approx(plain_quality(images, found.labels_))
+    assert found.cluster_centers_.shape == (5, 8)
+    assert (found.predict(images) == found.labels_).all()
+    nearest = np.linalg.norm(images[:, None] - found.cluster_centers_, axis=2).argmin(axis=1)
+    assert (found.predict(images) == nearest).all()
+
+
+def test_many_images_are_clustered_from_a_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(views, "MANY", 60)
+    images, truth = blobs(5, 100)
+    found = ViewClusterer(k_max=8, random_state=0).fit(images)
+    assert found.k_ == 5
+    assert adjusted_rand_score(truth, found.labels_) == 1
+
+
+def test_the_same_seed_gives_the_same_views() -> None:
+    images = np.random.default_rng(0).normal(size=(80, 4))
+    first, second = (ViewClusterer(random_state=3).fit(images) for _ in range(2))
+    assert first.quality_ == second.quality_
+    assert (first.labels_ == second.labels_).all()
+
+
+@pytest.mark.parametrize("clusterer", [AgglomerativeClustering(), KMeans(n_init=2)])
+def test_other_clusterers_are_swept(clusterer: Any) -> None:
+    images, truth = blobs(4, 15)
+    before = clusterer.get_params()
+    found = ViewClusterer(clusterer=clusterer, k_max=7, random_state=0).fit(images)
+    assert (found.k_, sorted(found.quality_)) == (4, [2, 3, 4, 5, 6, 7])
+    assert clusterer.get_params() == before
+    assert (found.predict(images) == found.labels_).all()
+    assert adjusted_rand_score(truth, found.predict(images + 0.01)) == 1
+
+
+@pytest.mark.parametrize("clusterer", [DBSCAN(eps=1.0, min_samples=3), MeanShift(bandwidth=1.5)])
+def test_clusterers_without_a_number_of_clusters_are_used_as_they_are(clusterer: Any) -> None:
+    images, truth = blobs(4, 15)
+    found = ViewClusterer(clusterer=clusterer).fit(images)
+    assert found.k_ == 4
+    assert list(found.quality_) == [4]
+    assert adjusted_rand_score(truth, found.predict(images)) == 1
+    assert hasattr(found, "cluster_centers_") == isinstance(clusterer, MeanShift)
+
+
+def test_noise_is_no_view() -> None:
+    images = np.concatenate([blobs(3, 15)[0], np.full((1, 8), 50.0)])
+    found = ViewClusterer(clusterer=DBSCAN(eps=1.0)).fit(images)
+    assert found.k_ == 3
+    assert found.labels_[-1] == -1
+    assert found.predict(images[-1:]).tolist() == [-1]
+
+
+def test_equal_images_are_one_view() -> None:
+    with pytest.warns(ImageWarning, match="all 6 images are equal: they are taken as one view"):
+        found = ViewClusterer().fit(np.ones((6, 3)))
+    assert found.k_ == 1
+    assert found.labels_.tolist() == [0] * 6
+    assert math.isnan(found.quality_[1])
+    assert found.predict([[2.0, 2.0, 2.0]]).tolist() == [0]
+
+
+def test_a_few_different_images_bound_k() -> None:
+    images = np.repeat(np.eye(3), 5, axis=0)
+    found = ViewClusterer(random_state=0).fit(images)
+    assert (found.k_, found.quality_[3], max(found.quality_)) == (3, math.inf, 3)
+    assert ViewClusterer().fit([[0.0], [1.0]]).k_ == 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"k": 0}, "k: expected a whole number of at least 1, got 0"),
+        ({"k": 2.5}, "k: expected a whole number"),
+        ({"k": 4}, "k: expected at most 3, as there are 3 different images among 6, got 4"),
+        ({"k_min": 1}, "k_min: expected a whole number of at least 2"),
+        ({"k_min": 5}, "k: expected at most 3"),
+        ({"k_min": 5, "k_max": 4}, "k_max: expected at least k_min = 5, got 4"),
+        ({"n_init": 0}, "n_init: expected"),
+        ({"clusterer": "k-means"}, "clusterer: expected a scikit-learn clusterer"),
+        ({"clusterer": DBSCAN(), "k": 2}, "k: DBSCAN finds the number of clusters itself"),
+    ],
+)
+def test_settings_that_contradict(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(PerceptionError, match=message):
+        ViewClusterer(**settings).fit(np.repeat(np.eye(3), 2, axis=0))
+
+
+def test_one_image_cannot_be_clustered() -> None:
+    with pytest.raises(ValueError, match=r"1 sample\(s\).*minimum of 2"):
+        ViewClusterer().fit([[1.0, 2.0]])
+
+
+def test_images_that_are_not_finite_need_the_transformer() -> None:
+    images = 1 / (0.3 + np.abs(blobs(3, 10)[0]))
+    images[::7, 0] = np.inf
+    with pytest.raises(ValueError, match="infinity"):
+        ViewClusterer().fit(images)
+    with pytest.warns(ImageWarning, match="5 of 240"):
+        labels = make_pipeline(ReciprocalTransformer(), ViewClusterer(random_state=0)).fit_predict(images)
+    assert len(labels) == 30
+
+
+# recognition
+
+
+def test_the_nearest_image_names_the_place() -> None:
+    images, truth = blobs(4, 10)
+    places = np.array(["north", "east", "south", "west"])[truth]
+    model = PlaceRecognizer().fit(images, places)
+    assert model.predict(images + 0.01).tolist() == places.tolist()
+    assert model.classes_.tolist() == sorted(set(places))
+    assert (model.predict_proba(images).sum(axis=1) == 1).all()
+    with pytest.raises(PerceptionError, match="n_neighbors: expected a whole number from 1 to the 40 images, got 41"):
+        PlaceRecognizer(41).fit(images, places)
+
+
+def test_a_learning_curve_rises_to_certainty() -> None:
+    images, truth = blobs(4, 30, spread=0.05)
+    curve = learning_curve(1 / (0.5 + np.abs(images)), truth, sizes=[1, 2, 4, 40, 120], random_state=0)
+    assert (curve.sizes, curve.folds, curve.untested) == ((1, 2, 4, 40, 120), 10, ())
+    assert curve.mean[-1] == curve.lowest[-1] == 1
+    assert curve.mean[0] < 0.3
+    assert all(a <= b <= c for a, b, c in zip(curve.lowest, curve.mean, curve.highest, strict=True))
+    assert 0.2 < curve.mean[1] <= 0.5  # two of four places have been seen
+
+
+def test_a_learning_curve_never_tests_on_what_it_learned() -> None:
+    # Every image is unlike all others, so that only an image itself could tell its label.
+    rng = np.random.default_rng(0)
+    curve = learning_curve(rng.uniform(1, 5, (400, 30)), rng.integers(20, size=400), sizes=[400], random_state=0)
+    assert curve.mean[0] < 0.15
+
+
+def test_places_seen_once_are_learned_and_not_tested() -> None:
+    images, truth = blobs(3, 10)
+    labels = np.append(truth, 3)
+    curve = learning_curve(np.abs(np.append(images, [[9.0] * 8], axis=0)) + 0.5, labels, sizes=[31], folds=5, random_state=0)
+    assert curve.untested == (3,)
+    assert curve.mean == (1.0,)
+
+
+def test_a_learning_curve_warns_once() -> None:
+    images, truth = blobs(2, 10)
+    images = np.abs(images) + 0.5
+    images[3, 3] = np.inf
+    with pytest.warns(ImageWarning) as caught:
+        learning_curve(images, truth, sizes=[10, 20], folds=2)
+    assert len(caught) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"sizes": [0]}, "sizes: expected numbers from 1 to the 6 images, got 0"),
+        ({"sizes": [7]}, "sizes: expected numbers from 1"),
+        ({"sizes": [6], "folds": 1}, "folds: expected at least 2"),
+        ({"sizes": [6], "folds": 7}, "folds: expected at most 6"),
+    ],
+)
+def test_learning_curves_that_cannot_be_drawn(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(PerceptionError, match=message):
+        learning_curve(np.ones((6, 2)), [0, 0, 0, 1, 1, 1], **arguments)
+
+
+# files
+
+
+def fitted() -> Any:
+    images, truth = blobs(3, 10)
+    return recogniser().fit(1 / (1 + np.abs(images)), np.array(["a", "b", "c"])[truth])
+
+
+@pytest.mark.parametrize("model", [ReciprocalTransformer(), ViewClusterer(random_state=0), ViewClusterer(clusterer=DBSCAN(eps=1.0))])
+def test_fitted_estimators_pickle_and_clone(model: Any) -> None:
+    images = np.abs(blobs(3, 10)[0]) + 1
+    model.fit(images)
+    again = pickle.loads(pickle.dumps(model))
+    method = "predict" if hasattr(model, "predict") else "transform"
+    assert (getattr(again, method)(images) == getattr(model, method)(images)).all()
+    assert repr(clone(model)) == repr(model)
+
+
+def test_a_recogniser_comes_back_from_its_file(tmp_path: Path) -> None:
+    model, path = fitted(), tmp_path / "a.skops"
+    store.save(model, path)
+    held = store.load(path)
+    images = np.random.default_rng(1).uniform(0.1, 2, (20, 8))
+    assert (held.model.predict(images) == model.predict(images)).all()
+    assert held.classes == ("a", "b", "c")
+    assert {"python", "numpy", "scikit-learn", "skops", "ssh-abduction"} == set(held.versions)
+    assert os.listdir(tmp_path) == ["a.skops"]
+
+
+@pytest.mark.parametrize("clusterer", [None, AgglomerativeClustering()])
+def test_views_come_back_from_their_file(tmp_path: Path, clusterer: Any) -> None:
+    images = blobs(3, 10)[0]
+    model = make_pipeline(ReciprocalTransformer(0.5), ViewClusterer(clusterer=clusterer, random_state=0)).fit(np.abs(images) + 1)
+    store.save(model, tmp_path / "a.skops")
+    held = store.load(tmp_path / "a.skops")
+    assert held.classes == ()
+    assert (held.model.predict(np.abs(images) + 1) == model.predict(np.abs(images) + 1)).all()
+
+
+class Trap:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.mark),)
+
+
+def test_hostile_and_damaged_files_run_nothing(tmp_path: Path) -> None:
+    mark, good = tmp_path / "mark", tmp_path / "good.skops"
+    store.save(fitted(), good)
+    whole = good.read_bytes()
+    schema = zipfile.ZipFile(good).read("schema.json").decode()
+    hostile: dict[str, bytes] = {
+        "pickle": pickle.dumps(Trap(mark)),
+        "partial": skops.io.dumps({"format": store.FORMAT, "model": functools.partial(os.mkdir, str(mark))}),
+        "function": skops.io.dumps({"format": store.FORMAT, "model": FunctionTransformer(os.mkdir)}),
+        "cut": whole[: len(whole) // 2],
+        "empty": b"",
+        "text": b"{}",
+        "another object": skops.io.dumps([1, 2]),
+        "no classes": skops.io.dumps({"format": store.FORMAT, "version": 1, "model": PlaceRecognizer()}),
+        "no model": skops.io.dumps({"format": store.FORMAT, "version": 1, "model": "os", "classes": [], "versions": {}}),
+        "another version": skops.io.dumps({"format": store.FORMAT, "version": 99, "model": PlaceRecognizer()}),
+    }
+    for name, changed in (
+        ("no schema", None),
+        ("broken schema", "{"),
+        ("another type", schema.replace("PlaceRecognizer", "Popen").replace("perception.recognition", "subprocess")),
+        ("another loader", schema.replace('"ObjectNode"', '"ReduceNode"')),
+    ):
+        path = tmp_path / "made"
+        with zipfile.ZipFile(good) as old, zipfile.ZipFile(path, "w") as new:
+            for part in old.namelist():
+                if part != "schema.json":
+                    new.writestr(part, old.read(part))
+            if changed is not None:
+                new.writestr("schema.json", changed)
+        hostile[name] = path.read_bytes()
+    for name, data in hostile.items():
+        path = tmp_path / "hostile.skops"
+        path.write_bytes(data)
+        with pytest.raises(PerceptionError, match="hostile"):
+            store.load(path)
+        assert not mark.exists(), name
+
+
+def test_an_archive_that_swells_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store.save(fitted(), tmp_path / "a.skops")
+    monkeypatch.setattr(store, "LARGEST", 100)
+    with pytest.raises(PerceptionError, match="expected at most 100 bytes once unpacked"):
+        store.load(tmp_path / "a.skops")
+
+
+def test_files_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(PerceptionError, match="expected a readable recogniser: No such file"):
+        store.load(tmp_path / "none.skops")
+    with pytest.raises(PerceptionError, match="cannot write the recogniser: No such file"):
+        store.save(fitted(), tmp_path / "none" / "a.skops")
+
+
+def test_what_could_not_be_read_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(PerceptionError, match="expected a model of types that can be read back"):
+        store.save(make_pipeline(FunctionTransformer(functools.partial(os.mkdir, "x"))), tmp_path / "a.skops")
+    assert not os.listdir(tmp_path)
+
+
+# the benchmark and the docstrings
+
+
+def test_the_benchmark_runs() -> None:
+    script = Path(__file__).parent.parent / "benchmarks" / "perception.py"
+    done = subprocess.run([sys.executable, script, "search", "places", "60"], check=True, capture_output=True, text=True)
+    assert "60 images" in done.stdout
+
+
+def test_docstrings_run() -> None:
+    import doctest
+    import importlib
+
+    for name in ("quality", "reciprocal", "views", "recognition"):
+        result = doctest.testmod(importlib.import_module(f"perception.{name}"))
+        assert result.failed == 0
+        assert result.attempted > 0
