@@ -23,6 +23,12 @@ class SolverError(SSHError):
     """The solver cannot do what was asked."""
 
 
+def named(source: object) -> str:
+    """A file's name as an error message shows it: on one line."""
+    text = str(source)
+    return text if text.isprintable() else repr(text)
+
+
 def brief(value: object, width: int = 60) -> str:
     """`value` as an error message shows it: on one line, cut to `width` characters."""
     text = repr(value)

@@ -19,6 +19,8 @@ from ssh_abduction import encodings, facts
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
+POLL = 0.05  # seconds between two questions whether to stop
+
 
 @dataclass(frozen=True, slots=True)
 class Clash:
@@ -49,21 +51,26 @@ class Explanation:
         return {"first": self.first, "last": self.last, "clashes": [{"axiom": c.axiom, "steps": list(c.steps)} for c in self.clashes]}
 
 
-def explain(trace: Trace, theory: Theory | None = None) -> Explanation | None:
+class Interrupted(Exception):  # noqa: N818 - not an error
+    """`stop` said that there is no more time."""
+
+
+def explain(trace: Trace, theory: Theory | None = None, stop: Callable[[], bool] = lambda: False) -> Explanation | None:
     """Why the trace has no map under a theory, or None if it has one.
 
-    The stretch is found by dropping steps from the end and from the start, the clashes by dropping axioms one by one.
+    The stretch is found by dropping steps from the end and from the start, the clashes by dropping axioms one by one. `stop` is asked
+    now and then; when it says yes, Interrupted is raised.
     """
     theory = (theory or Theory.topological()).resolve(trace)
     whole = len(trace)
-    length = _shortest(whole, lambda n: not _Axioms(_stretch(trace, 0, n), theory).consistent())
+    length = _shortest(whole, lambda n: not _Axioms(_stretch(trace, 0, n), theory, stop).consistent())
     if length is None:
         return None
     last = length - 1
-    length = _shortest(length, lambda n: not _Axioms(_stretch(trace, last + 1 - n, n), theory).consistent()) or length
+    length = _shortest(length, lambda n: not _Axioms(_stretch(trace, last + 1 - n, n), theory, stop).consistent()) or length
     first = last + 1 - length
     clashes: dict[str, list[int]] = {}
-    for axiom, step in _Axioms(_stretch(trace, first, length), theory, relaxed=True).smallest_clash():
+    for axiom, step in _Axioms(_stretch(trace, first, length), theory, stop, relaxed=True).smallest_clash():
         clashes.setdefault(axiom, []).append(first + step)
     order = [axiom.name for axiom in encodings.axioms()]
     found = tuple(Clash(name, tuple(sorted(clashes[name]))) for name in sorted(clashes, key=order.index))
@@ -91,7 +98,10 @@ def _shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:
 class _Axioms:
     """A trace and its axioms in clingo; where `relaxed`, each axiom can be switched at each step."""
 
-    def __init__(self, trace: Trace, theory: Theory, relaxed: bool = False) -> None:
+    def __init__(self, trace: Trace, theory: Theory, stop: Callable[[], bool], relaxed: bool = False) -> None:
+        self._stop = stop
+        if stop():
+            raise Interrupted
         self._control = clingo.Control(["--warn=none"])
         names = [name for name in facts.encoding_names(theory) if name not in ("preference", "show")]
         for name in [*names, "explain"] if relaxed else names:
@@ -105,7 +115,12 @@ class _Axioms:
 
     def consistent(self, active: Sequence[clingo.Symbol] = ()) -> bool:
         """Whether there is a map. Where the axioms are relaxed, those hold that are active."""
-        return bool(self._control.solve(assumptions=[(symbol, True) for symbol in active]).satisfiable)
+        with self._control.solve(assumptions=[(symbol, True) for symbol in active], async_=True) as handle:
+            while not handle.wait(POLL):
+                if self._stop():
+                    handle.cancel()
+                    raise Interrupted
+            return bool(handle.get().satisfiable)
 
     def smallest_clash(self) -> list[tuple[str, int]]:
         """Pairs of axiom and step that leave no map, while any proper subset of them does.

@@ -43,7 +43,8 @@ def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
             facts += [f"open({t},{slot})." for slot, is_open in enumerate(step.openings or ()) if is_open]
     done = {t: trace.actions[t] for t in range(max(start - 1, 0), stop - 1)}
     facts += [f"act({t},{_constant(action.name)})." for t, action in done.items()]
-    facts += [_kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None]
+    if theory.level == "topological":
+        facts += [_kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None]
     return "\n".join(facts)
 
 

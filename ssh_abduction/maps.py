@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
-from ssh_abduction.errors import MapError, brief
+from ssh_abduction.errors import MapError, brief, named
 from ssh_abduction.trace import View
 
 if TYPE_CHECKING:
@@ -154,7 +156,12 @@ class SSHMap:
         """The causal graph as GraphML text."""
         import networkx as nx
 
-        return "\n".join(nx.generate_graphml(self.to_networkx()))
+        graph = self.to_networkx()
+        for _, data in graph.nodes(data=True):
+            data["view"] = xml_text(str(data["view"]))
+        for *_, data in graph.edges(data=True):
+            data["action"] = xml_text(data["action"])
+        return "\n".join(nx.generate_graphml(graph))
 
     def to_dot(self) -> str:
         """The causal graph as Graphviz DOT text, with a cluster a place."""
@@ -175,18 +182,33 @@ class SSHMap:
         return "\n".join([*lines, "}"])
 
 
+def _writable(text: str) -> bool:
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def xml_text(text: str) -> str:
+    """A text without the characters that XML cannot hold, each replaced by U+FFFD."""
+    return re.sub("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
+
+
 def read_json(path: str | os.PathLike[str]) -> Any:
     """The JSON value in a file. Raises MapError that names the file and the line."""
+    source = "standard input" if str(path) == "-" else named(path)
     try:
-        return json.loads(FilePath(path).read_text(encoding="utf-8"))
+        text = sys.stdin.read() if str(path) == "-" else FilePath(path).read_text(encoding="utf-8")
+        return json.loads(text)
     except OSError as error:
-        raise MapError(f"{path}: expected a readable file of maps: {error.strerror or error}; check the path") from None
+        raise MapError(f"{source}: expected a readable file of maps: {error.strerror or error}; check the path") from None
     except json.JSONDecodeError as error:
         raise MapError(
-            f"{path}:{error.lineno}: expected JSON, got broken JSON at column {error.colno} ({error.msg}); write it with solve --json"
+            f"{source}:{error.lineno}: expected JSON, got broken JSON at column {error.colno} ({error.msg}); write it with solve --json"
         ) from None
-    except (UnicodeDecodeError, RecursionError):
-        raise MapError(f"{path}: expected JSON in UTF-8, got something else; write it with solve --json") from None
+    except (ValueError, RecursionError, AttributeError):  # other text, numbers without end, a closed stream
+        raise MapError(f"{source}: expected JSON in UTF-8, got something else; write it with solve --json") from None
 
 
 def maps_of(data: Any, where: str) -> list[SSHMap]:
@@ -229,7 +251,7 @@ class _Reader:
     def dstate(self, value: Any, name: str) -> DState:
         record = self.mapping(value, name)
         view = record.get("view")
-        if isinstance(view, bool) or not isinstance(view, str | int):
+        if isinstance(view, bool) or not isinstance(view, str | int) or (isinstance(view, str) and not _writable(view)):
             raise self.wrong(f"{name}.view", "a text or an integer", view)
         direction = self.optional(record.get("direction"), f"{name}.direction")
         path = self.optional(record.get("path"), f"{name}.path")
@@ -249,11 +271,14 @@ class _Reader:
 
     def path(self, value: Any, name: str) -> Path:
         record = self.mapping(value, name)
-        order = self.list(record, "order")
-        return Path(self.integer(record.get("id"), f"{name}.id"), tuple(self.integer(p, f"{name}.order[{i}]") for i, p in enumerate(order)))
+        order = tuple(self.integer(p, f"{name}.order[{i}]") for i, p in enumerate(self.list(record, "order")))
+        if len(set(order)) < len(order):
+            raise self.wrong(f"{name}.order", "each place once", list(order))
+        return Path(self.integer(record.get("id"), f"{name}.id"), order)
 
     def link(self, value: Any, ids: set[int], name: str) -> tuple[int, str, int]:
-        if not (isinstance(value, list) and len(value) == 3 and isinstance(value[1], str) and value[0] in ids and value[2] in ids):
+        good = isinstance(value, list) and len(value) == 3 and type(value[0]) is type(value[2]) is int and isinstance(value[1], str)
+        if not good or not {value[0], value[2]} <= ids:
             raise self.wrong(name, "[dstate, action name, dstate]", value)
         return value[0], value[1], value[2]
 

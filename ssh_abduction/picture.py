@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 import networkx as nx
 
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.maps import SSHMap, xml_text
 
 Point: TypeAlias = tuple[float, float]
 
@@ -156,7 +156,7 @@ def _dstates(ssh_map: SSHMap, place: int, at: Mapping[int, Point]) -> list[str]:
         title = f"dstate {s.id}: {s.view}"
         px, py = x + dx * (RADIUS + 6) + aside[0], y + dy * (RADIUS + 6) + aside[1]
         marks.append(
-            f'<g><title>{escape(title)}</title><path d="M-5,-5 L5,0 L-5,5 Z" fill="{colour}" '
+            f'<g><title>{_escaped(title)}</title><path d="M-5,-5 L5,0 L-5,5 Z" fill="{colour}" '
             f'transform="translate({px:.1f},{py:.1f}) rotate({math.degrees(bearing):.1f})"/></g>'
         )
         marks.append(_text(x + dx * DSTATE + aside[0] * 1.5, y + dy * DSTATE + aside[1] * 1.5, f"x{s.id}", "#222", halo=True))
@@ -173,7 +173,9 @@ def _bearing(ssh_map: SSHMap, path: int | None, direction: int | None, place: in
     """Which way on the page a dstate faces: to the next place of its path, or away from the last one."""
     if path is None or direction is None:
         return None
-    order = ssh_map.paths[path].order[:: 1 if direction == 1 else -1]
+    order = next(p.order for p in ssh_map.paths if p.id == path)[:: 1 if direction == 1 else -1]
+    if place not in order:
+        return None
     i = order.index(place)
     if i + 1 < len(order):
         (ax, ay), (bx, by) = at[place], at[order[i + 1]]
@@ -209,7 +211,7 @@ def _causal(ssh_map: SSHMap) -> tuple[list[str], list[Point]]:
         marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{RADIUS}" fill="white" stroke="{COLOURS[0]}" stroke-width="2"/>')
         marks.append(_text(x, y, f"x{s.id}", "#222", weight="bold"))
         label = str(s.view) if len(str(s.view)) <= LONGEST_LABEL else f"…{str(s.view)[1 - LONGEST_LABEL :]}"
-        marks.append(f"<g><title>{escape(f'dstate {s.id}: {s.view}')}</title>{_text(x, y + RADIUS + 12, label, '#222', halo=True)}</g>")
+        marks.append(f"<g><title>{_escaped(f'dstate {s.id}: {s.view}')}</title>{_text(x, y + RADIUS + 12, label, '#222', halo=True)}</g>")
     return marks, list(at.values())
 
 
@@ -217,8 +219,12 @@ def _text(x: float, y: float, text: str, colour: str, size: int = 12, weight: st
     edge = ' stroke="white" stroke-width="3" paint-order="stroke"' if halo else ""
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size}" font-weight="{weight}" fill="{colour}"{edge} '
-        f'text-anchor="middle" dominant-baseline="central">{escape(text)}</text>'
+        f'text-anchor="middle" dominant-baseline="central">{_escaped(text)}</text>'
     )
+
+
+def _escaped(text: str) -> str:
+    return escape(xml_text(text))
 
 
 def _page(marks: list[str], points: list[Point]) -> str:

@@ -43,7 +43,7 @@ class Log:
         actions: dict[str, int] = {}
         seen: dict[object, int] = {}
         self.actions = [actions.setdefault(a.name, len(actions)) for a in trace.actions]
-        self.seen = [seen.setdefault((step.view, type(step.view), step.openings if with_star else None), len(seen)) for step in trace.steps]
+        self.seen = [seen.setdefault((step.view, step.openings if with_star else None), len(seen)) for step in trace.steps]
 
     def replay(self, labels: Sequence[int], known: int | None = None) -> Replay:
         """Replay the trace over the map that `labels` make of its first steps; `known` of them make links (default all)."""

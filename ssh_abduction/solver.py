@@ -201,6 +201,9 @@ class Search:
         prefixes: bool = True,
         on_progress: Callable[[Progress], None] | None = None,
     ) -> None:
+        for name, value in (("limit", limit), ("maps", maps), ("memory", memory)):
+            if isinstance(value, bool) or not isinstance(value, int | float | None):
+                raise SolverError(f"{name}: expected a number, got {brief(value)}")
         if limit is not None and not limit > 0:
             raise SolverError(f"limit: expected a number of seconds above 0, got {brief(limit)}; leave it out for none")
         if maps < 0:
@@ -216,6 +219,8 @@ class Search:
         self.stopped: Stop | None = None
         self.complete = False
         self.count = 0
+        self._cost: tuple[int, ...] = ()
+        self._begun = False
         self._most = maps
         self._log = Log(trace, self.theory)
         self._whole = not prefixes or bool(self.theory.without)
@@ -229,6 +234,9 @@ class Search:
         return self._engine.size
 
     def __iter__(self) -> Iterator[SSHMap]:
+        if self._begun:
+            raise SolverError("search: expected to be iterated once, got a second time; make another Search")
+        self._begun = True
         self._watch.start()
         try:
             if self._find_cost():
@@ -251,7 +259,7 @@ class Search:
         if self.stopped and self.status is not Status.OPTIMAL:
             if self.best is None and self.stopped == "time limit":
                 self._salvage()
-            if self.best is not None:
+            if self.best is not None and self.status is Status.UNKNOWN:
                 self.status = Status.FEASIBLE
         if self.status in (Status.FEASIBLE, Status.OPTIMAL) and not self.count and self.best is not None:
             self.count = 1
@@ -261,12 +269,21 @@ class Search:
         """End the search soon, with the best answer so far. For signal handlers and other threads."""
         self._watch.interrupted = True
 
+    def over(self) -> bool:
+        """Whether the limits are over or the search was interrupted: for what is still to be done with its result."""
+        try:
+            self._watch.check()
+        except _Stopped as stop:
+            self.stopped = stop.reason
+            return True
+        return False
+
     def solution(self, maps: tuple[SSHMap, ...] = ()) -> Solution:
         """How the search ended, with the maps that the caller kept."""
         return Solution(
             status=self.status,
             maps=maps,
-            cost=Cost.of(self.best) if self.best else None,
+            cost=self._best_cost(),
             bound=self.bound,
             complete=self.complete,
             theory=self.theory,
@@ -283,49 +300,66 @@ class Search:
         size = steps if self._whole else min(steps, FIRST_PREFIX)
         while True:
             self._engine.grow(size)
-            minimal = None
-            for ssh_map in self._engine.improving_maps():
-                minimal = ssh_map
-                self._consider(ssh_map)
-                self._report()
+            minimal = self._minimise()
             if minimal is None:
                 self.status = Status.UNSATISFIABLE
                 return False
-            self.partial = minimal
-            self._raise_bound(minimal)
-            replayed = self._log.replay(minimal.labels)
+            self.partial = minimal.map
+            if self.theory.priorities:
+                self.bound = Bound(**{self.theory.priorities[0]: minimal.cost[0]})
+            replayed = self._log.replay(minimal.map.labels)
             if replayed.outcome is Outcome.PREDICTED:
                 self._keep(minimal, replayed.labels)
                 self.status = Status.OPTIMAL
-                self._cost = Cost.of(minimal)
                 return True
             size = self._extended(len(replayed.labels))
+
+    def _minimise(self) -> _Found | None:
+        """A minimal map of the prefix, or None where it has no map. Better maps of the whole trace are kept on the way."""
+        minimal = None
+        for found in self._engine.improving_maps():
+            minimal = found
+            replayed = self._log.replay(found.map.labels)
+            if replayed.outcome is Outcome.PREDICTED and (self.best is None or found.cost < self._cost):
+                self._keep(found, replayed.labels)
+            self._report()
+        return minimal
+
+    def _keep(self, found: _Found, labels: tuple[int, ...]) -> None:
+        self.best = replace(found.map, labels=labels)
+        self._cost = found.cost
+        self._watch.use_reserve()
 
     def _minimal_maps(self) -> Iterator[SSHMap]:
         """Every map of minimal cost, once, after those of the longest prefix that is needed have been seen to replay."""
         streamed: list[int] = []  # prefixes whose completely replayed maps went out already
+        enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
         while True:
             held: list[SSHMap] = []
             stuck = 0
             streaming = False
-            for ssh_map in self._engine.maps_of_cost(self._cost):
-                replayed = self._log.replay(ssh_map.labels)
-                if replayed.outcome is not Outcome.PREDICTED:
-                    stuck = max(stuck, len(replayed.labels))
-                    if streaming:
+            try:
+                for found in self._engine.maps_of_cost(self._cost):
+                    replayed = self._log.replay(found.map.labels)
+                    if replayed.outcome is not Outcome.PREDICTED:
+                        stuck = max(stuck, len(replayed.labels))
+                        if streaming:
+                            continue
+                        break
+                    if any(self._log.replay(found.map.labels, size).outcome is Outcome.PREDICTED for size in streamed):
                         continue
-                    break
-                if any(self._log.replay(ssh_map.labels, size).outcome is Outcome.PREDICTED for size in streamed):
-                    continue
-                whole = replace(ssh_map, labels=replayed.labels)
-                if streaming:
-                    yield whole
-                    continue
-                held.append(whole)
-                if len(held) == HELD_BACK:
-                    streaming = True
-                    yield from held
-                    held = []
+                    whole = replace(found.map, labels=replayed.labels)
+                    if streaming:
+                        yield whole
+                        continue
+                    held.append(whole)
+                    if len(held) == enough:
+                        streaming = True
+                        yield from held
+                        held = []
+            except _Stopped:
+                yield from held  # they replay at the proven cost: they are minimal
+                raise
             if not stuck:
                 yield from held
                 return
@@ -337,38 +371,30 @@ class Search:
         """A longer prefix that holds the step at which a replay failed."""
         return min(len(self.trace), max(failed + 1, int(self.prefix * GROWTH)))
 
-    def _consider(self, ssh_map: SSHMap) -> None:
-        """Keep a map, not yet proven minimal, if it explains the whole trace and is better than the best so far."""
-        replayed = self._log.replay(ssh_map.labels)
-        if replayed.outcome is Outcome.PREDICTED and (self.best is None or self._rank(ssh_map) < self._rank(self.best)):
-            self._keep(ssh_map, replayed.labels)
-
-    def _keep(self, ssh_map: SSHMap, labels: tuple[int, ...]) -> None:
-        self.best = replace(ssh_map, labels=labels)
-        self._watch.use_reserve()
-
-    def _rank(self, ssh_map: SSHMap) -> tuple[int, ...]:
-        return self._engine.counts(Cost.of(ssh_map))
-
-    def _raise_bound(self, minimal: SSHMap) -> None:
-        if self.theory.priorities:
-            first = self.theory.priorities[0]
-            self.bound = Bound(**{first: getattr(Cost.of(minimal), first)})
-
     def _salvage(self) -> None:
         """In the last part of the time limit, look for any map of the whole trace."""
         self._watch.use_reserve()
         self._watch.start()
         with suppress(_Stopped, KeyboardInterrupt):
             self._engine.grow(len(self.trace))
-            for ssh_map in self._engine.improving_maps():
-                self._consider(ssh_map)
+            self.status = Status.OPTIMAL if self._minimise() else Status.UNSATISFIABLE
         self._watch.stop()
+
+    def _best_cost(self) -> Cost | None:
+        """The counts of the best map; where axioms are left out, clingo may count more places or paths than the map can show."""
+        return replace(Cost.of(self.best), **dict(zip(self.theory.priorities, self._cost, strict=True))) if self.best else None
 
     def _report(self) -> None:
         if self._on_progress is not None:
-            cost = Cost.of(self.best) if self.best else None
-            self._on_progress(Progress(self.prefix, len(self.trace), cost, self.bound, self.count, self._watch.elapsed()))
+            self._on_progress(Progress(self.prefix, len(self.trace), self._best_cost(), self.bound, self.count, self._watch.elapsed()))
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A map of a prefix, and what it costs: the preferred counts, first to last."""
+
+    map: SSHMap
+    cost: tuple[int, ...]
 
 
 class _Stopped(Exception):  # noqa: N818 - not an error
@@ -427,6 +453,7 @@ class _Engine:
 
     def __init__(self, trace: Trace, theory: Theory, watch: _Watch) -> None:
         self.size = 0
+        self._asked: int | None = None  # the step that is the last one, as far as clingo knows
         self.ground_seconds = 0.0
         self.solve_seconds = 0.0
         self._trace = trace
@@ -437,16 +464,12 @@ class _Engine:
             self._control.load(encodings.path(name))
         self._control.add("base", [], facts.theory_facts(theory))
 
-    def counts(self, cost: Cost) -> tuple[int, ...]:
-        """The counts that the theory minimises, in its order of preference."""
-        return tuple(getattr(cost, count) for count in self._theory.priorities)
-
     def grow(self, size: int) -> None:
         """Let the prefix have `size` steps."""
         began = time.perf_counter()
-        control, old = self._control, self.size
+        control = self._control
         try:
-            if old == 0:
+            if self.size == 0:
                 control.ground([("base", [])])
             while self.size < size:
                 self._watch.check()
@@ -455,24 +478,25 @@ class _Engine:
                 control.add(part, [], facts.trace_facts(self._trace, self._theory, self.size, stop))
                 control.ground([(part, []), *(("step", facts.step_number(t)) for t in range(self.size, stop))])
                 self.size = stop
-            if self.size > old:
+            if self._asked != size - 1:
                 control.ground([("check", facts.step_number(size - 1))])
-                if old:
-                    control.release_external(facts.query(old - 1))
+                if self._asked is not None:
+                    control.release_external(facts.query(self._asked))
                 control.assign_external(facts.query(size - 1), True)
+                self._asked = size - 1
         finally:
             self.ground_seconds += time.perf_counter() - began
 
-    def improving_maps(self) -> Iterator[SSHMap]:
+    def improving_maps(self) -> Iterator[_Found]:
         """Maps of the prefix, each better than the one before; where the iteration ends, the last one is minimal."""
         return self._solve("opt" if self._theory.priorities else "ignore", 0 if self._theory.priorities else 1)
 
-    def maps_of_cost(self, cost: Cost) -> Iterator[SSHMap]:
+    def maps_of_cost(self, cost: tuple[int, ...]) -> Iterator[_Found]:
         """All maps of the prefix that cost this and no more."""
-        bound = ",".join(str(count) for count in self.counts(cost))
+        bound = ",".join(map(str, cost))
         return self._solve(f"enum,{bound}" if bound else "ignore", 0)
 
-    def _solve(self, mode: str, models: int) -> Iterator[SSHMap]:
+    def _solve(self, mode: str, models: int) -> Iterator[_Found]:
         configuration: Any = self._control.configuration.solve
         configuration.opt_mode = mode
         configuration.models = models
@@ -490,9 +514,9 @@ class _Engine:
                         if handle.get().interrupted:
                             raise _Stopped("interrupted")
                         break
-                    ssh_map = facts.read_map(model, self._trace, self._theory)
+                    found = _Found(facts.read_map(model, self._trace, self._theory), tuple(model.cost))
                     self.solve_seconds += time.perf_counter() - began
-                    yield ssh_map
+                    yield found
                     began = time.perf_counter()
             finally:
                 handle.cancel()

@@ -77,6 +77,8 @@ class Theory:
 
     def _set_names(self, field: str, allowed: Iterable[str]) -> None:
         value = getattr(self, field)
+        if not isinstance(value, str | list | tuple):
+            raise TheoryError(f"{field}: expected a list of names, got {brief(value)}")
         names = tuple(value.split(",")) if isinstance(value, str) else tuple(value)
         known = list(allowed)
         for i, name in enumerate(names):
@@ -155,8 +157,11 @@ class Theory:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Theory:
-        """The theory that `to_dict` wrote. Raises TheoryError."""
-        return cls().replace(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+        """The theory that `to_dict` wrote; fields that are missing are those of the level's preset. Raises TheoryError."""
+        if not isinstance(data, Mapping):
+            raise TheoryError(f"theory: expected an object, got {brief(data)}")
+        preset = cls.causal() if data.get("level") == "causal" else cls()
+        return preset.replace(**{str(k): tuple(v) if isinstance(v, list) else v for k, v in data.items()})
 
 
 PRESETS: dict[str, Callable[[], Theory]] = {

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias
 
-from ssh_abduction.errors import TraceError, brief
+from ssh_abduction.errors import TraceError, brief, named
 
 View: TypeAlias = str | int
 Kind: TypeAlias = Literal["travel", "turn"]
@@ -45,6 +45,17 @@ class Action:
     kind: Kind | None = None
     turn: TurnDirection | None = None
     extra: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name or "\0" in self.name:
+            raise TraceError(f"action.name: expected a text, got {brief(self.name)}; name the action")
+        if self.kind not in (None, *_KINDS):
+            raise TraceError(f'action.kind: expected "travel" or "turn", got {brief(self.kind)}; leave it out for other actions')
+        if (self.turn is not None or self.kind == "turn") and (self.kind != "turn" or self.turn not in _TURNS):
+            raise TraceError(
+                f'action.turn: expected "right", "left" or "around" for a turn, and none for others, '
+                f"got {brief(self.turn)} for kind {self.kind}; mend one of them"
+            )
 
     @staticmethod
     def of(value: Action | str | Mapping[str, Any]) -> Action:
@@ -84,8 +95,12 @@ class Step:
     star: tuple[float, ...] | None = None
     displacement: tuple[float, float, float] | None = None
     image: tuple[float, ...] | int | None = None
-    truth: Any = None
-    extra: Mapping[str, Any] = field(default_factory=dict)
+    truth: Any = field(default=None, hash=False)
+    extra: Mapping[str, Any] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        if self.view is not None:
+            _view(self.view, "view")
 
     @property
     def openings(self) -> Openings | None:
@@ -123,7 +138,7 @@ class Trace:
     steps: tuple[Step, ...]
     name: str | None = None
     images: str | None = None
-    extra: Mapping[str, Any] = field(default_factory=dict)
+    extra: Mapping[str, Any] = field(default_factory=dict, hash=False)
     source: str | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
@@ -221,14 +236,18 @@ class Trace:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Trace:
         """The trace in a JSON Lines file, or on standard input for "-". Raises TraceError with file, line and field."""
-        source = "standard input" if str(path) == "-" else str(path)
+        source = "standard input" if str(path) == "-" else named(path)
         try:
             if str(path) == "-":
+                if sys.stdin is None:
+                    raise TraceError("standard input: expected a trace, got a closed stream; name a file")
                 return _parse(sys.stdin.buffer, source)
             with Path(path).open("rb") as file:
                 return _parse(file, source)
         except OSError as error:
             raise TraceError(f"{source}: expected a readable trace file: {error.strerror or error}; check the path") from None
+        except ValueError as error:  # a null character in the path
+            raise TraceError(f"{source}: expected the path of a trace file: {error}") from None
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trace as JSON Lines. The file appears whole or not at all. Raises TraceError."""
@@ -252,7 +271,10 @@ class Trace:
 
 
 def _dump(value: Mapping[str, Any]) -> str:
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+    try:
+        return json.dumps(value, ensure_ascii=False, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise TraceError(f"trace: expected what JSON can hold, got {brief(dict(value))} ({error}); mend the field") from None
 
 
 def _parse(file: BinaryIO, source: str) -> Trace:
@@ -289,8 +311,11 @@ def _parse(file: BinaryIO, source: str) -> Trace:
 
 
 def _record(raw: bytes, where: str) -> dict[str, Any]:
-    def constant(text: str) -> Any:
-        raise ValueError(f"{text} is not a number of JSON; replace it, or leave the field out")
+    found: list[str] = []
+
+    def constant(text: str) -> float:
+        found.append(text)
+        return math.nan
 
     def integer(text: str) -> int:
         if len(text) > 100:
@@ -315,9 +340,33 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
         raise TraceError(f"{where}: line: expected one JSON object, got one nested too deeply; flatten it") from None
     except ValueError as error:
         raise TraceError(f"{where}: line: expected one JSON object, got {error}") from None
+    if found:
+        raise TraceError(f"{where}: {_where_nan(record)}: expected a finite number, got {found[0]}; replace it, or leave the field out")
+    if b"\\u" in raw:
+        _no_surrogates(record, where)
     if not isinstance(record, dict):
         raise TraceError(f"{where}: line: expected a JSON object in braces, got {brief(record)}; write one step a line")
     return record
+
+
+def _where_nan(value: Any, path: str = "") -> str:
+    """The field in which a value that is no number stands."""
+    inside: Iterable[tuple[Any, Any]] = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, item in inside:
+        here = f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}" if path else str(key)
+        if isinstance(item, float) and math.isnan(item):
+            return here
+        if isinstance(item, dict | list) and (deeper := _where_nan(item, here)):
+            return deeper
+    return ""
+
+
+def _no_surrogates(record: Any, where: str) -> None:
+    """Half a character cannot be written again: refuse it where it comes in."""
+    try:
+        json.dumps(record, ensure_ascii=False).encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise TraceError(f"{where}: line: expected text, got half a character, \\u{ord(error.object[error.start]):04x}; mend it") from None
 
 
 def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import networkx as nx
@@ -162,6 +163,20 @@ def test_check_under_another_theory(solved: Path, capsys: pytest.CaptureFixture[
     assert "next_place" in capsys.readouterr().out
 
 
+def test_flags_are_laid_over_the_theory_of_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["solve", ACES, "--json", "--boundary", "none"]) == 0
+    loose = tmp_path / "loose.json"
+    loose.write_text(capsys.readouterr().out)
+    assert main(["check", ACES, str(loose)]) == 0
+    assert main(["check", ACES, str(loose), "--boundary", "strict"]) == 20
+    assert "0 of 8 maps satisfy the 27 axioms" in capsys.readouterr().out
+    data = json.loads(loose.read_text())
+    for theory, message in ((5, "theory: expected an object"), ({"prefer": None}, "prefer: expected a list")):
+        loose.write_text(json.dumps({**data, "theory": theory}))
+        assert main(["check", ACES, str(loose)]) == 1
+        assert message in capsys.readouterr().err
+
+
 def test_check_takes_one_saved_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trace = rectangle(8)
     (ssh_map,) = solve(trace).maps
@@ -232,7 +247,19 @@ def test_bad_input_is_one_line(verb: str, case: str, tmp_path: Path, capsys: pyt
     assert re.fullmatch(rf"ssh-abduction: {re.escape(str(path))}:\d+: [^\n]+\n", captured.err)
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"maps": 3}', '{"labels": [0], "dstates": 3}', "{", '{"maps": [{}]}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "9" * 5000,
+        '{"labels": [0], "dstates": [{"id": 0, "view": "\\ud800"}], "links": []}',
+        "",
+        "[]",
+        '{"maps": 3}',
+        '{"labels": [0], "dstates": 3}',
+        "{",
+        '{"maps": [{}]}',
+    ],
+)
 @pytest.mark.parametrize("verb", ["show", "check"])
 def test_bad_maps_are_one_line(verb: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "maps.json"
@@ -256,12 +283,51 @@ def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
 
 
+def test_strange_names_stay_on_their_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "two\nlines"
+    path.write_text("{}")
+    assert main(["solve", str(path)]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    trace = saved(Trace.from_steps(["a\nb\x1b[31m", "\x01\ufffe"], ["travel"]), tmp_path)
+    assert main(["solve", trace]) == 0
+    assert "a\\nb\\x1b[31m" in capsys.readouterr().out
+    assert main(["solve", trace, "--json"]) == 0
+    (tmp_path / "maps.json").write_text(capsys.readouterr().out)
+    for form in ("--svg", "--graphml", "--dot"):
+        assert main(["show", str(tmp_path / "maps.json"), form]) == 0
+        if form != "--dot":
+            ET.fromstring(capsys.readouterr().out)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_output_that_cannot_be_written() -> None:
+    for target in ("> /dev/full", ">&-"):
+        done = subprocess.run(
+            f"{sys.executable} -m ssh_abduction solve {ACES} --json {target}", shell=True, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 1
+        assert done.stderr.count("\n") == 1
+    done = subprocess.run(f"{sys.executable} -m ssh_abduction solve - <&-", shell=True, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+
+
+def test_a_terminal_of_few_letters() -> None:
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(
+        [sys.executable, "-m", "ssh_abduction", "solve", ACES], env=environment, capture_output=True, text=True, check=True
+    )
+    assert "travel ? 1" in done.stdout
+
+
 def test_standard_input_and_a_reader_that_leaves(tmp_path: Path) -> None:
     trace = Path(ACES).read_bytes()
     command = [sys.executable, "-m", "ssh_abduction", "solve", "-"]
     done = subprocess.run(command, input=trace, capture_output=True, check=True)
     assert done.stdout.startswith(b"optimal: 19 dstates")
     assert done.stderr == b""  # no progress where there is no terminal
+    maps = subprocess.run([*command, "--json"], input=trace, capture_output=True, check=True).stdout
+    shown = subprocess.run([sys.executable, "-m", "ssh_abduction", "show", "-"], input=maps, capture_output=True, check=True).stdout
+    assert shown.count(b"path 0: places") == 4
     pipe = subprocess.run(f"{sys.executable} -m ssh_abduction facts {ACES} | head -1", shell=True, capture_output=True, check=True)
     assert pipe.stderr == b""
 

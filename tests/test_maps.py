@@ -61,6 +61,9 @@ def test_maps_survive_files(tmp_path: Path) -> None:
     [
         ({"labels": [9]}, "labels[0]: expected the id of a dstate, got 9"),
         ({"labels": "no"}, "labels: expected a list"),
+        ({"links": [[1.0, "travel", 0]]}, "links[0]: expected [dstate, action name, dstate]"),
+        ({"links": [[[1], "travel", 0]]}, "links[0]: expected [dstate, action name, dstate]"),
+        ({"paths": [{"id": 0, "order": [0, 1, 0]}]}, "paths[0].order: expected each place once"),
         ({"links": [[0, "travel", 77]]}, "links[0]: expected [dstate, action name, dstate]"),
         ({"places": []}, "places: expected every id that is used, got none for [0, 1]"),
         ({"paths": [{"id": 3, "order": []}]}, "paths: expected every id that is used, got none for [0]"),

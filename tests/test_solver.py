@@ -10,6 +10,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from worlds import TOURS, drive, rectangle, written
 import ssh_abduction.solver as solver_module
 from ssh_abduction import Progress, Search, SolverError, SSHMap, Status, Theory, TheoryError, Trace, TraceError, solve
 from ssh_abduction.checker import check
+from ssh_abduction.explain import Interrupted, explain
 from ssh_abduction.facts import links_of
 from ssh_abduction.replay import Log, Outcome
 
@@ -205,7 +207,9 @@ def test_progress_is_reported() -> None:
     assert reports[-1].maps == 2
 
 
-@pytest.mark.parametrize(("choices", "word"), [({"limit": 0}, "limit"), ({"maps": -1}, "maps"), ({"memory": 0}, "memory")])
+@pytest.mark.parametrize(
+    ("choices", "word"), [({"limit": "5"}, "limit"), ({"limit": 0}, "limit"), ({"maps": -1}, "maps"), ({"memory": 0}, "memory")]
+)
 def test_limits_that_make_no_sense(choices: dict[str, int], word: str) -> None:
     with pytest.raises(SolverError, match=f"^{word}: expected"):
         solve(rectangle(4), **choices)  # type: ignore[arg-type]
@@ -222,6 +226,7 @@ def test_limits_that_make_no_sense(choices: dict[str, int], word: str) -> None:
         ({"level": "causal"}, "boundary: expected none with level=causal"),
         ({"next_place": 1}, "next_place: expected true or false"),
         ({"colour": "red"}, "theory: expected fields out of"),
+        ({"prefer": 5}, "prefer: expected a list of names, got 5"),
     ],
 )
 def test_theories_that_make_no_sense(choices: dict[str, object], message: str) -> None:
@@ -231,6 +236,9 @@ def test_theories_that_make_no_sense(choices: dict[str, object], message: str) -
 
 
 def test_theories_survive_a_round_trip() -> None:
+    assert Theory.from_dict({"level": "causal"}) == Theory.causal()
+    with pytest.raises(TheoryError, match="theory: expected an object, got 5"):
+        Theory.from_dict(5)  # type: ignore[arg-type]
     for theory in (*THEORIES.values(), Theory(boundary="defeasible", prefer=("paths", "excuses"), without=("on_path",))):
         assert Theory.from_dict(theory.to_dict()) == theory
 
@@ -299,6 +307,76 @@ def test_nothing_that_infers_reads_the_truth() -> None:
     bare = replace(route, steps=tuple(replace(step, truth=None) for step in route.steps))
     answers = [[m.to_dict() for m in solve(trace).maps] for trace in (route, shuffled, bare)]
     assert answers[0] == answers[1] == answers[2]
+
+
+def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
+    """A limit that stops the growth leaves no old horizon behind: growing on gives what growing at once gives."""
+    trace = drive(*TOURS["comb"])
+    theory = Theory.topological().resolve(trace)
+
+    class Impatient(solver_module._Watch):
+        left = 100
+
+        def check(self) -> None:
+            self.left -= 1
+            if not self.left:
+                raise solver_module._Stopped("time limit")
+
+    watch = Impatient(None, None, lambda: None)
+    engine = solver_module._Engine(trace, theory, watch)
+    engine.grow(4)
+    watch.left = 2
+    with pytest.raises(solver_module._Stopped):
+        engine.grow(len(trace))
+    assert 4 < engine.size < len(trace)
+    engine.grow(len(trace))
+    minimal = list(engine.improving_maps())[-1]
+    assert {found.map for found in engine.maps_of_cost(minimal.cost)} == set(solve(trace, theory, maps=0, prefixes=False).maps)
+
+
+def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
+    search = Search(drive(*TOURS["comb"]), theory, maps=0)
+    honest = search._engine.maps_of_cost
+
+    def interrupted(cost: tuple[int, ...]) -> Iterator[object]:
+        yield from itertools.islice(honest(cost), 200)
+        raise solver_module._Stopped("interrupted")
+
+    monkeypatch.setattr(search._engine, "maps_of_cost", interrupted)
+    maps = tuple(search)
+    solution = search.solution(maps)
+    assert (solution.count, len(set(maps)), solution.complete, solution.stopped) == (200, 200, False, "interrupted")
+    assert solution.status is Status.OPTIMAL
+
+
+def test_a_search_runs_once() -> None:
+    search = Search(rectangle(4))
+    assert len(list(search)) == 1
+    with pytest.raises(SolverError, match="iterated once"):
+        list(search)
+
+
+def test_costs_are_right_where_a_map_cannot_show_them() -> None:
+    """Without one_place a dstate may be at many places; the map shows the first, the cost counts all."""
+    solution = solve(Trace.from_steps("aaaaa", ["travel"] * 4), Theory(prefer=("places",), without=("one_place",)), maps=0)
+    assert solution.cost is not None
+    assert (solution.cost.places, solution.bound.places, solution.count) == (5, 5, 11)
+
+
+def test_an_explanation_can_be_interrupted() -> None:
+    trace = Trace.from_steps("abcd", ["travel", "around", "around"])
+    with pytest.raises(Interrupted):
+        explain(trace, stop=lambda: True)
+    asked = itertools.count()
+    assert explain(trace, stop=lambda: next(asked) > 10**6) == explain(trace)
+
+
+def test_two_searches_at_once() -> None:
+    """In threads of their own, where no signal arrives."""
+    with ThreadPoolExecutor(2) as pool:
+        answers = list(pool.map(lambda n: solve(rectangle(n)).cost, [8, 16, 8, 16, 24, 32]))
+    assert answers[1:] == answers[:-1]
 
 
 # Symmetry: what a trace is called does not matter.

@@ -82,8 +82,8 @@ BAD: dict[str, tuple[list[str], str]] = {
     "header of another type": (["[1, 2]", LAST], "1: line: expected a JSON object"),
     "header alone": ([HEADER], "2: step: expected at least one"),
     "name that is no text": (['{"format": "ssh-trace", "version": 1, "name": 3}', LAST], "1: name: expected a text"),
-    "NaN": ([HEADER, '{"view": "a", "displacement": [NaN, 0, 0]}'], "2: line: expected one JSON object, got NaN"),
-    "infinite range": ([HEADER, '{"image": [1, Infinity]}'], "2: line: expected one JSON object, got Infinity"),
+    "NaN": ([HEADER, '{"view": "a", "displacement": [NaN, 0, 0]}'], "2: displacement[0]: expected a finite number, got NaN"),
+    "infinite range": ([HEADER, '{"image": [1, Infinity]}'], "2: image[1]: expected a finite number, got Infinity"),
     "number that overflows": ([HEADER, '{"image": [1, 1e999]}'], "2: image[1]: expected a finite number"),
     "number of a million digits": ([HEADER, '{"view": ' + "1" * 10**6 + "}"], "2: line: expected one JSON object, got a number"),
     "no view": ([HEADER, '{"action": "travel"}', LAST], "2: view: expected"),
@@ -115,6 +115,11 @@ BAD: dict[str, tuple[list[str], str]] = {
     "two objects on a line": ([HEADER, LAST + LAST], "2: line: expected one JSON object, got broken JSON"),
     "empty line inside": ([HEADER, STEP, "", LAST], "3: line: expected a step, got an empty line"),
     "a number on a line": ([HEADER, "5"], "2: line: expected a JSON object in braces, got 5"),
+    "NaN in the truth": (
+        [HEADER, '{"view": "a", "truth": {"pose": [1, [2, -Infinity]]}}'],
+        "2: truth.pose[1][1]: expected a finite number, got -Inf",
+    ),
+    "half a character": ([HEADER, '{"view": "a\\ud800"}'], "2: line: expected text, got half a character, \\ud800"),
     "nested too deeply": (
         [HEADER, '{"view": "a", "x": ' + "[" * 10**5 + "]" * 10**5 + "}"],
         "2: line: expected one JSON object, got one nested",
@@ -217,6 +222,36 @@ def test_any_file_is_a_trace_or_a_clear_error(data: bytes) -> None:
             message = str(error)
         assert not message or message.startswith(file.name)
         assert "\n" not in message
+
+
+def test_traces_can_be_keys() -> None:
+    traces = [Trace.from_steps("ab", ["travel"], name="n") for _ in range(2)]
+    assert len(set(traces)) == 1
+    truthful = Step(view="a", truth={"place": [1]}, extra={"x": []})
+    assert hash(truthful) == hash(Step(view="a"))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "turn"),
+    [("spin", "turn", None), ("x", "hop", None), ("x", "travel", "right"), (5, "travel", None), ("", None, None), ("x", None, "left")],
+)
+def test_actions_that_make_no_sense(name: str, kind: str, turn: str) -> None:
+    with pytest.raises(TraceError, match=r"^action\.(name|kind|turn): expected"):
+        Action(name, kind, turn)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("view", [1.5, True, 2**40, "a\0"])
+def test_steps_that_make_no_sense(view: str) -> None:
+    with pytest.raises(TraceError, match=r"^view: expected"):
+        Step(view=view)
+
+
+def test_what_json_cannot_hold_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(TraceError, match="expected what JSON can hold"):
+        Trace((Step(view="a", truth=float("inf")),)).save(tmp_path / "t.jsonl")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(TraceError):
+        Trace.load("a\0b")
 
 
 def test_an_action_prints_and_compares() -> None:

@@ -7,6 +7,8 @@ the axioms, or a checked map breaks one | 30 nothing in time | 130 interrupted
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -37,7 +39,12 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     options = parser().parse_args(arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal that knows no "→" shows "?"
     try:
+        if sys.stdout is None:
+            raise SSHError("standard output: expected a place to print to, got a closed stream; open it, or send it to a file")
         code = int(options.run(options))
         sys.stdout.flush()
     except SSHError as error:
@@ -49,4 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Whoever read the output has seen enough; what Python still holds back must not raise again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        print(f"ssh-abduction: {error.filename or 'output'}: cannot be written: {error.strerror or error}; make room", file=sys.stderr)
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_ERROR
     return code

@@ -20,17 +20,14 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("maps", help="what solve --json printed, or one saved map")
     add_theory(parser)
     parser.set_defaults(run=run, theory=None)
-    parser.epilog = "Without --theory, the theory is the one that the file of maps was solved under."
+    parser.epilog = "Without --theory, the theory is the one that the file of maps was solved under; other flags are laid over it."
 
 
 def run(options: argparse.Namespace) -> int:
     trace = Trace.load(options.trace)
     data = read_json(options.maps)
-    if options.theory is None and isinstance(data, dict) and isinstance(data.get("theory"), dict):
-        theory = Theory.from_dict(data["theory"])
-    else:
-        options.theory = options.theory or "topological"
-        theory = theory_of(options)
+    found = data.get("theory") if isinstance(data, dict) else None
+    theory = theory_of(options, None if found is None else Theory.from_dict(found))
     maps = maps_of(data, str(options.maps))
     broken = 0
     for i, ssh_map in enumerate(maps):

@@ -27,9 +27,11 @@ def add_theory(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--without", metavar="AXIOMS", help="leave these axioms out; commas between")
 
 
-def theory_of(options: argparse.Namespace) -> Theory:
-    """The theory that the options ask for. Raises TheoryError."""
+def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theory:
+    """The theory that the options ask for: over the preset, or over the one found where no preset is named. Raises TheoryError."""
     chosen = {f.name: getattr(options, f.name) for f in fields(Theory) if getattr(options, f.name, None) is not None}
     if "prefer" in chosen and not chosen["prefer"]:
         chosen["prefer"] = ()
-    return PRESETS[options.theory]().replace(**chosen)
+    if options.theory is None and found is not None:
+        return found.replace(**chosen)
+    return PRESETS[options.theory or "topological"]().replace(**chosen)

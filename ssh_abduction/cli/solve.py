@@ -14,7 +14,7 @@ from typing import Any
 
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.text import describe, differences
-from ssh_abduction.explain import Explanation, explain
+from ssh_abduction.explain import Explanation, Interrupted, explain
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import Progress, Search, Solution, Status
 from ssh_abduction.trace import Trace
@@ -47,13 +47,23 @@ def run(options: argparse.Namespace) -> int:
         )
         with _interrupts(search):
             kept = _print_json(search) if options.json else list(_first(search, SHOWN))
+            explanation = _explained(search)
         solution = search.solution(tuple(kept))
-    explanation = explain(trace, solution.theory) if solution.status is Status.UNSATISFIABLE else None
     if options.json:
         _print_end(search, solution, explanation)
     else:
         _print_text(search, solution, explanation)
-    return 130 if solution.stopped == "interrupted" else EXIT_CODES[solution.status]
+    return 130 if search.stopped == "interrupted" else EXIT_CODES[solution.status]
+
+
+def _explained(search: Search) -> Explanation | None:
+    """Why there is no map, if that is so and there is time to find out."""
+    if search.status is not Status.UNSATISFIABLE:
+        return None
+    try:
+        return explain(search.trace, search.theory, search.over)
+    except Interrupted:
+        return None
 
 
 def _first(search: Search, most: int) -> Iterator[SSHMap]:
@@ -100,6 +110,9 @@ def _dump(value: dict[str, Any]) -> str:
 def _print_text(search: Search, solution: Solution, explanation: Explanation | None) -> None:
     if explanation:
         print(f"{solution.status.value}: {explanation}")
+        return
+    if solution.status is Status.UNSATISFIABLE:
+        print(f"unsatisfiable: no map satisfies the axioms; why was not found out in time ({solution.stopped})")
         return
     why = f" ({solution.stopped})" if solution.stopped else ""
     seconds = f"{solution.seconds.total:.2f} s, {solution.prefix} of {solution.steps} steps given to clingo"

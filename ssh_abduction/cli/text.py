@@ -10,9 +10,14 @@ from ssh_abduction.trace import Trace
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Columns aligned under a head."""
-    cells = [[*head], *([str(cell) for cell in row] for row in rows)]
+    cells = [[*head], *([_printable(str(cell)) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     return "\n".join("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells)
+
+
+def _printable(text: str) -> str:
+    """A text without what would break the table or steer the terminal."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def describe(ssh_map: SSHMap) -> str:

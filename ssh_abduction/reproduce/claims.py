@@ -246,7 +246,9 @@ def claims(name: str) -> list[Claim]:
         Claim(
             "clustering alone, k = number of dstates: U < 1 or dstates share views",
             "yes",
-            lambda r: f"U {r.alone_uncertainty:.3f}, {r.alone_distinct} of {e.dstates} distinct",
+            lambda r: (
+                f"U {r.alone_uncertainty:.3f}, {r.alone_distinct} of {e.dstates} distinct; M {r.quality[e.dstates]:.1f} against {r.quality[r.k]:.1f}"
+            ),
             lambda r: r.alone_uncertainty < 1 - 1e-9 or r.alone_distinct < e.dstates,
         ),
         Claim(

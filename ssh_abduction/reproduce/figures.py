@@ -139,16 +139,16 @@ def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[flo
         ("map right", lambda o: float(o.right), "Greens"),
         ("recognition rate (true labels)", lambda o: o.rate, "viridis"),
     ]
+    lowest = {"map right": 0.0, "U at that k": 0.7, "recognition rate (true labels)": 0.4, "k chosen by M": 2}
     for axes, (title, value, colours) in zip(grid.flat, panels, strict=True):
-        table = np.array([[value(cell[n, t]) for t in scales] for n in notches])
-        lowest = {"map right": 0.0, "U at that k": 0.7, "recognition rate (true labels)": 0.4, "k chosen by M": 2}
+        table = np.round([[value(cell[n, t]) for t in scales] for n in notches], 3)
         axes.imshow(table, origin="lower", cmap=colours, aspect="auto", vmin=lowest[title])
         for i, n in enumerate(notches):
             for j, t in enumerate(scales):
                 o = cell[n, t]
                 text = {"k chosen by M": str(o.k), "map right": "yes" if o.right else "no"}.get(title, f"{table[i, j]:.2f}")
                 middle = (table.min() + table.max()) / 2
-                dark = table[i, j] <= middle if colours == "viridis" else table[i, j] > middle
+                dark = table[i, j] < max(middle, lowest[title]) if colours == "viridis" else table[i, j] > middle
                 axes.text(j, i, text, ha="center", va="center", fontsize=8, color="white" if dark else "black")
                 if as_in_paper(o):
                     axes.add_patch(pyplot.Rectangle((j - 0.47, i - 0.47), 0.94, 0.94, fill=False, edgecolor=ORANGE, linewidth=2))
