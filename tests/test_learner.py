@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import json
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -122,6 +124,29 @@ def test_images_from_a_sidecar_file(run: Trace, tmp_path: Path) -> None:
         images_of(Trace.load(tmp_path / "run.jsonl"))
 
 
+def test_clustering_into_another_folder_keeps_the_images(run: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.savez(tmp_path / "scans.npz", images=images_of(run))
+    indexed = replace(run, images="scans.npz", steps=tuple(replace(step, image=i) for i, step in enumerate(run.steps)))
+    indexed.save(tmp_path / "run.jsonl")
+    (tmp_path / "views").mkdir()
+    assert main(["cluster", str(tmp_path / "run.jsonl"), "-o", str(tmp_path / "views" / "v.jsonl"), "--k", "4"]) == 0
+    capsys.readouterr()
+    np.testing.assert_array_equal(images_of(Trace.load(tmp_path / "views" / "v.jsonl")), images_of(run))
+
+
+def test_what_was_replaced_is_said_in_one_line(tmp_path: Path) -> None:
+    table = np.array([[1.0, np.inf, 2.0], [1.0, 1.0, np.nan], [3.0, 1.0, 0.0], [3.0, 1.1, 1.0]])
+    np.save(tmp_path / "scans.npy", table)
+    steps = [Step(image=i, action=Trace.from_steps("ab", ["travel"]).actions[0] if i < 3 else None) for i in range(4)]
+    Trace(tuple(steps), images="scans.npy").save(tmp_path / "run.jsonl")
+    words = ["cluster", str(tmp_path / "run.jsonl"), "-o", str(tmp_path / "v.jsonl")]
+    done = subprocess.run([sys.executable, "-m", "ssh_abduction", *words], capture_output=True, text=True, check=True)
+    assert done.stderr == (
+        "ssh-abduction: warning: 3 of 12 ranges were replaced: 1 infinite and 1 missing (NaN) are taken as nothing seen, "
+        "1 of zero or less as 0.05 m\n"
+    )
+
+
 def test_images_that_cannot_be_a_table() -> None:
     uneven = Trace((Step(image=(1.0, 2.0), action=None),))
     steps = (replace(uneven.steps[0], action=Trace.from_steps("ab", ["travel"]).actions[0]), Step(image=(1.0,)))
@@ -212,6 +237,8 @@ def test_from_simulation_to_recognition_in_the_shell(tmp_path: Path, capsys: pyt
 def test_errors_of_the_wings_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trace = tmp_path / "t.jsonl"
     Trace.from_steps("ab", ["travel"]).save(trace)
+    one = tmp_path / "one.jsonl"
+    Trace((Step(image=(1.0, 2.0)),)).save(one)
     (tmp_path / "cut.skops").write_bytes(b"PK\x03\x04")
     (tmp_path / "maps.json").write_text(json.dumps(solve(Trace.from_steps("a", [])).maps[0].to_dict()))
     for words, message in [
@@ -219,6 +246,7 @@ def test_errors_of_the_wings_are_one_line(tmp_path: Path, capsys: pytest.Capture
         (["simulate", "notched-rectangle", "--tours", "0", "-o", str(tmp_path / "x")], "tours: expected 1 or more"),
         (["simulate", "notched-rectangle", "--route", "travel,travel", "-o", str(tmp_path / "x")], "expected a free way ahead, got a wall"),
         (["cluster", str(trace), "-o", str(tmp_path / "x")], "image: expected one, got none"),
+        (["cluster", str(one), "-o", str(tmp_path / "x")], "minimum of 2 is required"),
         (["train", str(trace), str(tmp_path / "maps.json"), "-o", str(tmp_path / "x")], "expected labels for the 2 steps"),
         (["recognise", str(tmp_path / "cut.skops"), str(trace)], "expected a .skops file"),
         (["reproduce", "taylor-hall", "--seeds", "x"], "--seeds: expected numbers"),

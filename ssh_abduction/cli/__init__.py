@@ -11,6 +11,7 @@ import contextlib
 import io
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
 
@@ -45,7 +46,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if sys.stdout is None:
             raise SSHError("standard output: expected a place to print to, got a closed stream; open it, or send it to a file")
-        code = int(options.run(options))
+        with warnings.catch_warnings(record=True) as caught:
+            try:
+                code = int(options.run(options))
+            finally:
+                for warning in caught:
+                    print(f"ssh-abduction: warning: {warning.message}", file=sys.stderr)
         sys.stdout.flush()
     except SSHError as error:
         print(f"ssh-abduction: {error}", file=sys.stderr)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
+from dataclasses import replace
+from pathlib import Path
 
 from ssh_abduction.cli.options import Verbs
 from ssh_abduction.cli.text import table
@@ -30,14 +33,18 @@ def run(options: argparse.Namespace) -> int:
 
     trace = Trace.load(options.trace)
     images = ReciprocalTransformer().fit_transform(images_of(trace))
-    clusterer = ViewClusterer(k=options.k, k_max=options.k_max, random_state=options.seed).fit(images)
+    try:
+        clusterer = ViewClusterer(k=options.k, k_max=options.k_max, random_state=options.seed).fit(images)
+    except ValueError as error:  # scikit-learn's own words for what cannot be clustered
+        raise SSHError(f"{options.trace}: images: {error}; log more images, or others") from None
     truth = true_dstates(trace)
     uncertainty: dict[int, float] = {}
     if truth is not None:
         for k in clusterer.quality_:
             labels = clusterer.labels_ if k == clusterer.k_ else ViewClusterer(k=k, random_state=options.seed).fit(images).labels_
             uncertainty[k] = uncertainty_coefficient(labels, truth)
-    trace.with_views(clusterer.labels_.tolist()).save(options.output)
+    beside = trace.images and os.path.relpath(Path(trace.source or ".").parent / trace.images, Path(options.output).parent)
+    replace(trace.with_views(clusterer.labels_.tolist()), images=beside).save(options.output)
     rows = [
         [k, f"{m:.3f}", *([f"{uncertainty[k]:.3f}"] if uncertainty else []), "chosen" if k == clusterer.k_ else ""]
         for k, m in clusterer.quality_.items()
@@ -55,11 +62,3 @@ def true_dstates(trace: Trace) -> list[str] | None:
     """The true dstates, where every step tells one."""
     found = [step.truth.get("dstate") if isinstance(step.truth, dict) else None for step in trace.steps]
     return [str(name) for name in found] if all(name is not None for name in found) else None
-
-
-def known(trace: Trace) -> list[str]:
-    """The true dstates. Raises SSHError where a step tells none."""
-    truth = true_dstates(trace)
-    if truth is None:
-        raise SSHError("truth: expected a true dstate at every step, got a trace without; evaluate without --truth")
-    return truth

@@ -147,7 +147,8 @@ table{{border-collapse:collapse}}td,th{{padding:.25em .8em;border-bottom:1px sol
 figure{{display:inline-block;margin:1em 1em 1em 0;vertical-align:top;max-width:28em}}img{{max-width:100%}}figcaption{{font-size:13px;color:#555}}</style></head>
 <body><h1>{escape(title)}: claim, paper, here</h1>
 <p>Kuipers &amp; Beeson, “Bootstrap Learning for Place Recognition”, AAAI 2002. {len(runs)} seeds; figures are of seed {runs[0].seed}.
-The world, the robot and its laser were fixed before the seeds were run. All can be made again: <code>configuration.json</code> says with what.</p>
+The world, the robot and its laser were fixed before the seeds were run, on other seeds.
+The pages of the paper were not at hand: its figures are taken in the order of its text. All can be made again: <code>configuration.json</code> says with what.</p>
 <table><tr><th>claim</th><th>paper</th><th>here</th><th>holds in seeds</th></tr>
 {rows}
 </table>
