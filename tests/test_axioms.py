@@ -22,11 +22,11 @@ Answer = tuple[tuple[int, int, int] | None, int]
 CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
     "functional_view": (PLAIN, "b L a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "deterministic": (PLAIN, "a R a R b R a", "", ((3, 1, 0), 2), ((2, 1, 0), 1)),
-    "one_place": (PLAIN, "a T a", "", ((2, 2, 1), 1), ((1, 1, 1), 1)),
+    "one_place": (PLAIN, "a T a", "", ((2, 2, 1), 1), ((1, 2, 1), 1)),
     "turn_stays": (FRAME, "b L a", "right right+back", (NONE, 0), ((2, 2, 0), 1)),
     "travel_leaves": (PLAIN, "a T a", "", ((2, 2, 1), 1), ((1, 1, 1), 1)),
     "travel_follows_path": (PLAIN, "a T a", "", ((2, 2, 1), 1), ((2, 2, 0), 1)),
-    "one_course": (ON_PATHS, "a L a", "", ((2, 1, 2), 1), ((1, 1, 1), 1)),
+    "one_course": (ON_PATHS, "a L a", "", ((2, 1, 2), 1), ((1, 1, 2), 1)),
     "turn_around_reverses": (ON_PATHS, "c A c", "", ((2, 1, 1), 1), ((1, 1, 1), 1)),
     "turn_changes_path": (ON_PATHS, "b L a", "", ((2, 1, 2), 1), ((2, 1, 1), 1)),
     "one_dstate_per_course": (PLAIN, "a T b A c A d", "", (NONE, 0), ((4, 2, 1), 1)),
