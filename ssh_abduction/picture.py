@@ -27,11 +27,15 @@ AXES = ((0, -1), (1, 0), (0, 1), (-1, 0))  # up, right, down, left on the page
 
 def svg(ssh_map: SSHMap, turns: Mapping[str, str] | None = None) -> str:
     """The map as SVG text. `turns` says which way an action of another name than right, left and around turns."""
-    turns = {name: name for name in QUARTERS} | dict(turns or {})
     if not ssh_map.places:
         return _page(*_causal(ssh_map))
-    at = _right_angled(ssh_map, turns) or _spread(ssh_map)
-    return _page(*_topological(ssh_map, at))
+    return _page(*_topological(ssh_map, layout(ssh_map, turns)))
+
+
+def layout(ssh_map: SSHMap, turns: Mapping[str, str] | None = None) -> dict[int, Point]:
+    """Where to draw each place, x to the right and y down."""
+    turns = {name: name for name in QUARTERS} | dict(turns or {})
+    return _right_angled(ssh_map, turns) or _spread(ssh_map)
 
 
 def _right_angled(ssh_map: SSHMap, turns: Mapping[str, str]) -> dict[int, Point] | None:

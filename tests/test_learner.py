@@ -271,7 +271,7 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     assert "report.html" in out
     made = {p.name for p in tmp_path.iterdir()}
     assert {"report.html", "claims.json", "runs.json", "configuration.json", "run.jsonl", "world.png", "views.png", "quality.png"} <= made
-    assert {"learning.png", "spread.png", "map.svg"} <= made
+    assert {"learning.png", "spread.png", "map.svg", "map.png", "map-with-openings.png"} <= made
     page = (tmp_path / "report.html").read_text()
     for name in ("world.png", "learning.png", "map.svg"):
         assert f'src="{name}"' in page

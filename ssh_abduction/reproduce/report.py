@@ -78,8 +78,9 @@ def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> 
     figures.draw_learning(folder / "learning.png", {"labels from the map": run.curve})
     figures.draw_spread(folder / "spread.png", run.spread)
     starred = BootstrapLearner(WITH_STARS).fit(trace)
-    (folder / "map.svg").write_text(svg(learner.map_) + "\n", encoding="utf-8")
-    (folder / "map-with-openings.svg").write_text(svg(starred.map_) + "\n", encoding="utf-8")
+    for file, ssh_map in (("map", learner.map_), ("map-with-openings", starred.map_)):
+        (folder / f"{file}.svg").write_text(svg(ssh_map) + "\n", encoding="utf-8")
+        figures.draw_map(folder / f"{file}.png", ssh_map)
     on_done("figures")
 
 
