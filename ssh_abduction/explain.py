@@ -107,7 +107,12 @@ class _Axioms:
         for name in [*names, "explain"] if relaxed else names:
             self._control.load(encodings.path(name))
         last = len(trace) - 1
-        self._control.add("base", [], facts.theory_facts(theory) + facts.trace_facts(trace, theory, 0, len(trace)))
+        self._control.add(
+            "base",
+            [],
+            facts.theory_facts(theory, len(trace) if relaxed else facts.most_paths(trace, theory, len(trace)))
+            + facts.trace_facts(trace, theory, 0, len(trace)),
+        )
         steps = [("step", facts.step_number(t)) for t in range(len(trace))]
         self._control.ground([("base", []), *steps, ("check", facts.step_number(last))])
         self._control.assign_external(facts.query(last), True)

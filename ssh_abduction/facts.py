@@ -24,12 +24,20 @@ def encoding_names(theory: Theory) -> tuple[str, ...]:
     return (*names, "preference", "show")
 
 
-def theory_facts(theory: Theory) -> str:
-    """The axioms and the preference of a theory as facts."""
+def theory_facts(theory: Theory, paths: int) -> str:
+    """The axioms and the preference of a theory, and names for so many paths, as facts."""
     facts = [f"axiom({name})." for name in theory.axioms]
+    facts += [f"path(1..{paths})."] if theory.level == "topological" else []
     facts += [f"prefer({count},{len(theory.priorities) - i})." for i, count in enumerate(theory.priorities)]
     facts += ["defeasible."] if theory.boundary == "defeasible" else []
     return "\n".join(facts)
+
+
+def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
+    """The most paths that a map of the first steps can have: a path begins at the start, or where a turn right or left ends."""
+    if theory.without:
+        return steps
+    return 1 + sum(action.turn in ("right", "left") for action in trace.actions[: steps - 1])
 
 
 def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
@@ -55,7 +63,7 @@ def program(trace: Trace, theory: Theory) -> str:
         [
             f"% {len(trace)} steps{f' of {trace.name!r}' if trace.name else ''}. In the folder of the encodings, run",
             f"%   python run.py --project=project --opt-mode=optN -n 0 THIS_FILE {files}",
-            theory_facts(theory),
+            theory_facts(theory, most_paths(trace, theory, len(trace))),
             trace_facts(trace, theory, 0, len(trace)),
             "",
         ]

@@ -26,6 +26,12 @@ the order of preference by (1), so it is one of the prefix's minimal maps, R. As
 only links of R, F has the labels of the replayed R, the same links, and so the same support for every course: F is
 the replayed R. Different R replay to different maps, as they differ on the prefix already. ∎
 
+*Names for paths.* Grounding grows with the square of the number of names for paths, and most traces have far more legs than their
+maps have paths. So a control starts with a few names, and what it finds minimal stands if no map with more paths can be as good:
+where fewest paths come first, once there is any map; where fewest dstates come first, once there are half as many names as
+dstates in the minimal map, as every path holds the two ends of a travel, and a dstate is along one path (with all_on_paths a path may hold one dstate
+alone). Else the control is made again with more names, at most one for each leg of the prefix, which is enough for any map.
+
 A map of the prefix that stops early is no answer; what its continuations are, the longer prefix says. The claim needs
 determinism, and that a dstate has one place, course and heading. A theory `without` axioms is therefore solved in one go.
 """
@@ -52,6 +58,7 @@ from ssh_abduction.trace import Trace
 FIRST_PREFIX = 8  # steps; short enough that solving it costs next to nothing
 GROWTH = 1.25  # a prefix grows at least by this factor, so that there are few
 HELD_BACK = 1000  # maps kept until a prefix proves long enough; from there on they stream
+FIRST_PATHS = 8  # names for paths to begin with
 RESERVE = 0.2  # share of the time limit kept for finding any map of the whole trace
 POLL = 0.05  # seconds between looks at the clock and for Ctrl-C
 TICK = 0.5  # seconds between reports of progress while clingo is busy
@@ -226,7 +233,7 @@ class Search:
         self._whole = not prefixes or bool(self.theory.without)
         self._on_progress = on_progress
         self._watch = _Watch(limit, memory, self._report)
-        self._engine = _Engine(trace, self.theory, self._watch)
+        self._engine = _Engine(trace, self.theory, self._watch, min(FIRST_PATHS, facts.most_paths(trace, self.theory, len(trace))))
 
     @property
     def prefix(self) -> int:
@@ -316,14 +323,36 @@ class Search:
 
     def _minimise(self) -> _Found | None:
         """A minimal map of the prefix, or None where it has no map. Better maps of the whole trace are kept on the way."""
-        minimal = None
-        for found in self._engine.improving_maps():
-            minimal = found
-            replayed = self._log.replay(found.map.labels)
-            if replayed.outcome is Outcome.PREDICTED and (self.best is None or found.cost < self._cost):
-                self._keep(found, replayed.labels)
-            self._report()
-        return minimal
+        while True:
+            minimal = None
+            for found in self._engine.improving_maps():
+                minimal = found
+                replayed = self._log.replay(found.map.labels)
+                if replayed.outcome is Outcome.PREDICTED and (self.best is None or found.cost < self._cost):
+                    self._keep(found, replayed.labels)
+                self._report()
+            if not self._name_paths(minimal.cost if minimal else None):
+                return minimal
+
+    def _name_paths(self, cost: tuple[int, ...] | None) -> bool:
+        """Take a control with more names for paths, if the minimal cost found needs them. Says whether it was so."""
+        needed = self._paths_needed(cost)
+        if needed <= self._engine.paths:
+            return False
+        self._engine = self._engine.with_paths(needed)
+        return True
+
+    def _paths_needed(self, cost: tuple[int, ...] | None) -> int:
+        """How many names for paths it takes to be sure that no map of the prefix has another cost, or is missed at this one."""
+        legs = facts.most_paths(self.trace, self.theory, self.prefix)
+        first = self.theory.priorities[0] if self.theory.priorities else None
+        if self.theory.level == "causal":
+            return 0
+        if cost is None or self.theory.without or first not in ("paths", "dstates"):
+            return legs
+        if first == "paths":
+            return cost[0]
+        return min(legs, cost[0] // (1 if self.theory.all_on_paths else 2))
 
     def _keep(self, found: _Found, labels: tuple[int, ...]) -> None:
         self.best = replace(found.map, labels=labels)
@@ -366,6 +395,7 @@ class Search:
             if streaming:
                 streamed.append(self.prefix)
             self._engine.grow(self._extended(stuck))
+            self._name_paths(self._cost)
 
     def _extended(self, failed: int) -> int:
         """A longer prefix that holds the step at which a replay failed."""
@@ -451,8 +481,9 @@ def peak_memory() -> float:
 class _Engine:
     """One clingo control that holds the axioms for a growing prefix of a trace."""
 
-    def __init__(self, trace: Trace, theory: Theory, watch: _Watch) -> None:
+    def __init__(self, trace: Trace, theory: Theory, watch: _Watch, paths: int) -> None:
         self.size = 0
+        self.paths = paths  # names for paths
         self._asked: int | None = None  # the step that is the last one, as far as clingo knows
         self.ground_seconds = 0.0
         self.solve_seconds = 0.0
@@ -462,7 +493,14 @@ class _Engine:
         self._control = clingo.Control(["--warn=none"])
         for name in facts.encoding_names(theory):
             self._control.load(encodings.path(name))
-        self._control.add("base", [], facts.theory_facts(theory))
+        self._control.add("base", [], facts.theory_facts(theory, paths))
+
+    def with_paths(self, paths: int) -> _Engine:
+        """Another control for the same prefix, with more names for paths."""
+        engine = _Engine(self._trace, self._theory, self._watch, paths)
+        engine.ground_seconds, engine.solve_seconds = self.ground_seconds, self.solve_seconds
+        engine.grow(self.size)
+        return engine
 
     def grow(self, size: int) -> None:
         """Let the prefix have `size` steps."""

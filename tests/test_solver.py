@@ -68,6 +68,7 @@ def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(solver_module, "FIRST_PREFIX", 1)
         patch.setattr(solver_module, "GROWTH", 1.0)
+        patch.setattr(solver_module, "FIRST_PATHS", 1)
         by_prefix = solve(trace, theory, maps=0)
     at_once = solve(trace, theory, maps=0, prefixes=False)
     assert set(by_prefix.maps) == set(at_once.maps)
@@ -323,7 +324,7 @@ def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
                 raise solver_module._Stopped("time limit")
 
     watch = Impatient(None, None, lambda: None)
-    engine = solver_module._Engine(trace, theory, watch)
+    engine = solver_module._Engine(trace, theory, watch, paths=10)
     engine.grow(4)
     watch.left = 2
     with pytest.raises(solver_module._Stopped):
