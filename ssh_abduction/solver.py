@@ -253,7 +253,9 @@ class Search:
                         return
                     self.count += 1
                     self._report()
+                    self._watch.stop()
                     yield ssh_map
+                    self._watch.start()
                 self.complete = True
             elif self.status is Status.UNSATISFIABLE:
                 self.complete = True
@@ -277,7 +279,10 @@ class Search:
         self._watch.interrupted = True
 
     def over(self) -> bool:
-        """Whether the limits are over or the search was interrupted: for what is still to be done with its result."""
+        """Whether the limits are over or the search was interrupted: for what is still to be done with its result. The clock runs on."""
+        if not self._watch.running:
+            self._watch.use_reserve()
+            self._watch.start()
         try:
             self._watch.check()
         except _Stopped as stop:
@@ -447,6 +452,10 @@ class _Watch:
 
     def start(self) -> None:
         self._started = time.perf_counter()
+
+    @property
+    def running(self) -> bool:
+        return self._started is not None
 
     def use_reserve(self) -> None:
         """From now on the whole time limit may be used."""

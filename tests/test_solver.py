@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -363,6 +364,24 @@ def test_costs_are_right_where_a_map_cannot_show_them() -> None:
     solution = solve(Trace.from_steps("aaaaa", ["travel"] * 4), Theory(prefer=("places",), without=("one_place",)), maps=0)
     assert solution.cost is not None
     assert (solution.cost.places, solution.bound.places, solution.count) == (5, 5, 11)
+
+
+def test_the_time_of_the_caller_does_not_count() -> None:
+    theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
+    search = Search(drive(*TOURS["comb"]), theory, maps=5, limit=4)
+    for _ in search:
+        time.sleep(1)
+    assert (search.count, search.stopped) == (5, "maps limit")
+
+
+def test_the_clock_runs_on_for_an_explanation() -> None:
+    search = Search(Trace.from_steps("abcd", ["travel", "around", "around"]), limit=1)
+    assert list(search) == []
+    assert search.status is Status.UNSATISFIABLE
+    assert not search.over()
+    time.sleep(1.1)
+    assert search.over()
+    assert search.stopped == "time limit"
 
 
 def test_an_explanation_can_be_interrupted() -> None:
