@@ -29,6 +29,11 @@ MANY = 5_000  # images up to which k-means starts again and again on all of them
 ROUNDS = 30  # of k-means at most, where there are so many: first over the sample, then over all from the sample's best centres
 
 
+def labels_by_k(clusterer: ViewClusterer, images: ArrayLike) -> dict[int, NDArray[np.intp]]:
+    """The views of the images, (n,), for each k that a fitted clusterer tried, by clustering again with that k."""
+    return {k: clusterer.labels_ if k == clusterer.k_ else clone(clusterer).set_params(k=k).fit(images).labels_ for k in clusterer.quality_}
+
+
 class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     """Clusters images, (n, d), into k views; k is given, or is the one in [k_min, k_max] with the largest M (eq. 5), the smallest of equals.
 

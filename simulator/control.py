@@ -66,8 +66,7 @@ class Driver:
         """Move, and make sure that the robot is still where it can be."""
         self.robot.move(forward, turn)
         x, y, _ = self.robot.pose
-        left, bottom, right, top = self.world.bounds
-        if not (left < x < right and bottom < y < top):
+        if not self.world.holds(x, y):
             raise SimulatorError(f"{self.world.name}: the robot left the world at ({x:.2f}, {y:.2f}); close the gap in the walls")
         if forward and self.world.clearance(x, y) < self.robot.body.radius:
             raise SimulatorError(

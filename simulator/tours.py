@@ -67,8 +67,7 @@ def simulate(
         raise SimulatorError(f"{world.name}: route: expected at least one action, got none; add it to the world, or give one")
     body = body or Body()
     x, y, _ = world.start
-    left, bottom, right, top = world.bounds
-    if not (left < x < right and bottom < y < top) or world.clearance(x, y) < body.radius:
+    if not world.holds(x, y) or world.clearance(x, y) < body.radius:
         raise SimulatorError(f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, {y}); move it")
     rng = np.random.default_rng(seed)
     robot = Robot(body, world.start, rng)

@@ -72,6 +72,11 @@ class World:
         xs, ys = self.segments[:, ::2], self.segments[:, 1::2]
         return float(xs.min()), float(ys.min()), float(xs.max()), float(ys.max())
 
+    def holds(self, x: float, y: float) -> bool:
+        """Whether a point is within the bounds of the walls."""
+        left, bottom, right, top = self.bounds
+        return left < x < right and bottom < y < top
+
     def arranged(self, rng: np.random.Generator) -> World:
         """This world as one tour finds it: the clutter has been moved, and is part of the walls."""
         parts = [self.segments]

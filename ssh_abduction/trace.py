@@ -47,15 +47,17 @@ class Action:
     extra: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name or "\0" in self.name:
-            raise TraceError(f"action.name: expected a text, got {brief(self.name)}; name the action")
-        if self.kind not in (None, *_KINDS):
-            raise TraceError(f'action.kind: expected "travel" or "turn", got {brief(self.kind)}; leave it out for other actions')
-        if (self.turn is not None or self.kind == "turn") and (self.kind != "turn" or self.turn not in _TURNS):
-            raise TraceError(
-                f'action.turn: expected "right", "left" or "around" for a turn, and none for others, '
-                f"got {brief(self.turn)} for kind {self.kind}; mend one of them"
-            )
+        name, kind, turn = self.name, self.kind, self.turn
+        if not isinstance(name, str) or not name or "\0" in name:
+            raise TraceError(f"action.name: expected a text, got {brief(name)}; name the action")
+        if kind not in (None, *_KINDS):
+            raise TraceError(f'action.kind: expected "travel" or "turn", got {brief(kind)}; leave it out for other actions')
+        if turn not in (None, *_TURNS):
+            raise TraceError(f'action.turn: expected "right", "left" or "around", got {brief(turn)}; choose the nearest')
+        if turn is not None and kind != "turn":
+            raise TraceError(f'action.kind: expected "turn", as the action has a turn, got {brief(kind)}; set the kind or drop the turn')
+        if kind == "turn" and turn is None:
+            raise TraceError('action.turn: expected "right", "left" or "around" for a turn, got none; say which way it goes')
 
     @staticmethod
     def of(value: Action | str | Mapping[str, Any]) -> Action:
@@ -427,21 +429,15 @@ def _action(value: Any, where: str) -> Action:
     if not isinstance(value, Mapping):
         raise TraceError(f'{where}: expected a name or {{"name": …, "kind": …}}, got {brief(value)}; name the action')
     name, kind, turn = (value.get(key) for key in _ACTION_FIELDS)
-    if not isinstance(name, str) or not name or "\0" in name:
-        raise TraceError(f"{where}.name: expected a text, got {brief(name)}; name the action")
-    if kind is None and turn is None and name in STANDARD_ACTIONS:
-        kind, turn = STANDARD_ACTIONS[name].kind, STANDARD_ACTIONS[name].turn
-    if kind not in (None, *_KINDS):
-        raise TraceError(f'{where}.kind: expected "travel" or "turn", got {brief(kind)}; leave it out for other actions')
+    standard = STANDARD_ACTIONS.get(name) if isinstance(name, str) else None
+    if kind is None and turn is None and standard is not None:
+        kind, turn = standard.kind, standard.turn
     if kind == "turn" and turn is None and name in _TURNS:
         turn = name
-    if turn not in (None, *_TURNS):
-        raise TraceError(f'{where}.turn: expected "right", "left" or "around", got {brief(turn)}; choose the nearest')
-    if turn is not None and kind != "turn":
-        raise TraceError(f'{where}.kind: expected "turn", as the action has a turn, got {brief(kind)}; set the kind or drop the turn')
-    if kind == "turn" and turn is None:
-        raise TraceError(f'{where}.turn: expected "right", "left" or "around" for a turn, got none; say which way it goes')
-    return Action(name, kind, turn, {k: v for k, v in value.items() if k not in _ACTION_FIELDS})
+    try:
+        return Action(name, kind, turn, {k: v for k, v in value.items() if k not in _ACTION_FIELDS})  # type: ignore[arg-type]
+    except TraceError as error:  # the action knows its field, this knows its line
+        raise TraceError(f"{where.removesuffix('action')}{error}") from None
 
 
 def _numbers(value: Any, where: str) -> list[float]:

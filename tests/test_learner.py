@@ -185,7 +185,7 @@ def test_the_claims_are_those_of_the_paper() -> None:
 
 def test_recognition_by_poor_labels_is_poor(run: Trace) -> None:
     truth = true_dstates(run)
-    images = 1 / images_of(run)
+    images = images_of(run)
     codes = np.unique(truth, return_inverse=True)[1]
     assert rate(images, codes, truth, 0) > 0.95
     assert rate(images, codes % 4, truth, 0) == pytest.approx(0.5, abs=0.1)

@@ -29,7 +29,7 @@ def run(options: argparse.Namespace) -> int:
     from perception.images import images_of
     from perception.quality import uncertainty_coefficient
     from perception.reciprocal import ReciprocalTransformer
-    from perception.views import ViewClusterer
+    from perception.views import ViewClusterer, labels_by_k
 
     trace = Trace.load(options.trace)
     images = ReciprocalTransformer().fit_transform(images_of(trace))
@@ -40,9 +40,7 @@ def run(options: argparse.Namespace) -> int:
     truth = true_dstates(trace)
     uncertainty: dict[int, float] = {}
     if truth is not None:
-        for k in clusterer.quality_:
-            labels = clusterer.labels_ if k == clusterer.k_ else ViewClusterer(k=k, random_state=options.seed).fit(images).labels_
-            uncertainty[k] = uncertainty_coefficient(labels, truth)
+        uncertainty = {k: uncertainty_coefficient(labels, truth) for k, labels in labels_by_k(clusterer, images).items()}
     beside = trace.images and os.path.relpath(Path(trace.source or ".").parent / trace.images, Path(options.output).parent)
     replace(trace.with_views(clusterer.labels_.tolist()), images=beside).save(options.output)
     rows = [

@@ -21,7 +21,7 @@ from perception.images import images_of
 from perception.quality import uncertainty_coefficient
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import LearningCurve, learning_curve, recogniser
-from perception.views import ViewClusterer
+from perception.views import ViewClusterer, labels_by_k
 from simulator.control import STILL
 from simulator.laser import Laser
 from simulator.tours import simulate
@@ -100,10 +100,9 @@ def measure(name: str, seed: int) -> Run:
     trace = simulate(world, e.tours, seed)
     truth = true_dstates(trace)
     learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(k_max=e.k_max, random_state=seed), limit=60).fit(trace)
-    images = ReciprocalTransformer().fit_transform(images_of(trace))
+    ranges = images_of(trace)
     quality = learner.clusterer_.quality_
-    labelings = {k: ViewClusterer(k=k, random_state=seed).fit(images).labels_ for k in quality}
-    labelings[learner.clusterer_.k_] = learner.views_
+    labelings = labels_by_k(learner.clusterer_, ReciprocalTransformer().fit_transform(ranges))
     uncertainty = {k: uncertainty_coefficient(labels, truth) for k, labels in labelings.items()}
     starred = solve(trace.with_views(learner.views_.tolist()), WITH_STARS, limit=60)
     pairs = _aliased(learner.views_, truth)
@@ -125,11 +124,11 @@ def measure(name: str, seed: int) -> Run:
         right=one_to_one(learner.labels_, truth),
         aliased=len(pairs),
         told_apart=sum(not set(learner.labels_[truth == a]) & set(learner.labels_[truth == b]) for a, b in pairs),
-        curve=learning_curve(images_of(trace), learner.labels_, sizes, random_state=seed),
+        curve=learning_curve(ranges, learner.labels_, sizes, random_state=seed),
         rates={
-            "clustering alone": rate(images, alone, truth, seed),
-            "map": rate(images, learner.labels_, truth, seed),
-            "truth": rate(images, np.unique(truth, return_inverse=True)[1], truth, seed),
+            "clustering alone": rate(ranges, alone, truth, seed),
+            "map": rate(ranges, learner.labels_, truth, seed),
+            "truth": rate(ranges, np.unique(truth, return_inverse=True)[1], truth, seed),
         },
         alone_uncertainty=uncertainty_coefficient(alone, truth),
         alone_distinct=e.dstates - len({name for pair in _aliased(alone, truth) for name in pair}),
@@ -149,19 +148,19 @@ def one_to_one(labels: NDArray[Any], truth: NDArray[Any]) -> bool:
     return bool((labels >= 0).all()) and len(set(zip(labels, truth, strict=True))) == len(set(labels)) == len(set(truth))
 
 
-def rate(images: NDArray[np.float64], labels: NDArray[Any], truth: NDArray[Any], seed: int) -> float:
+def rate(ranges: NDArray[np.float64], labels: NDArray[Any], truth: NDArray[Any], seed: int) -> float:
     """Recognition of the true dstate, 10-fold cross-validated, by a recogniser that learns other labels.
 
     Each label stands for the dstate that it goes with most often in the training part: the best that it can be worth.
     """
     found = []
-    for train, test in StratifiedKFold(10, shuffle=True, random_state=seed).split(images, truth):
+    for train, test in StratifiedKFold(10, shuffle=True, random_state=seed).split(ranges, truth):
         names, codes = np.unique(labels[train], return_inverse=True)
         dstates, of = np.unique(truth[train], return_inverse=True)
         size = max(len(names), len(dstates))
         meaning = confusion_matrix(codes, of, labels=range(size)).argmax(axis=1)
-        model = recogniser().fit(1 / images[train], codes)
-        found.append(np.mean(dstates[meaning[model.predict(1 / images[test])]] == truth[test]))
+        model = recogniser().fit(ranges[train], codes)
+        found.append(np.mean(dstates[meaning[model.predict(ranges[test])]] == truth[test]))
     return float(np.mean(found))
 
 
@@ -329,7 +328,8 @@ def outcome(notch: float, scale: float, seed: int = 0) -> Outcome:
     means, offsets, truth = _driven(notch, seed)
     rng, laser = np.random.default_rng(seed), Laser()
     scans = [laser.scan(world, means + scale * offsets, rng) for _ in range(STILL)]
-    images = ReciprocalTransformer().fit_transform(np.median(scans, axis=0))
+    ranges = np.median(scans, axis=0)
+    images = ReciprocalTransformer().fit_transform(ranges)
     clusterer = ViewClusterer(k_max=10, n_init=4, random_state=seed).fit(images)
     actions = [world.route[i % len(world.route)] for i in range(len(means) - 1)]
     solution = solve(Trace.from_steps(clusterer.labels_.tolist(), actions), VIEWS_ALONE, limit=5)
@@ -340,7 +340,7 @@ def outcome(notch: float, scale: float, seed: int = 0) -> Outcome:
         clusterer.k_,
         uncertainty_coefficient(clusterer.labels_, truth),
         solution.complete and solution.count == 1 and one_to_one(np.array(solution.maps[0].labels), truth),
-        rate(images, np.unique(truth, return_inverse=True)[1], truth, seed),
+        rate(ranges, np.unique(truth, return_inverse=True)[1], truth, seed),
     )
 
 
