@@ -1,14 +1,17 @@
 """From what a robot saw and did, find the map: every minimal map of distinctive states, places and paths."""
 
+from ssh_abduction.apart import Certificate
 from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
 from ssh_abduction.maps import DState, Path, SSHMap
 from ssh_abduction.solver import Bound, Cost, Progress, Search, Solution, Status, solve
+from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Step, Trace
 
 __all__ = [
     "Action",
     "Bound",
+    "Certificate",
     "Cost",
     "DState",
     "MapError",
@@ -19,6 +22,7 @@ __all__ = [
     "Search",
     "Solution",
     "SolverError",
+    "Speedups",
     "Status",
     "Step",
     "Theory",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
 from clingo import Function, Model, Number, String, Symbol
@@ -12,6 +12,7 @@ from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Trace
 
 _COURSE = {"pos": 1, "neg": -1}
+BEYOND = Function("beyond")  # assumed by who asks for a map with dstates that have no name
 
 
 def encoding_names(theory: Theory) -> tuple[str, ...]:
@@ -140,6 +141,45 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
         paths=tuple(Path(h, _in_order(h, dstates, pairs)) for h in path_of.values()),
         excused=tuple(sorted((path_of[h], path_of[g]) for h, g in excused if h in path_of and g in path_of)),
     )
+
+
+def name_facts(names: Iterable[tuple[int, int]], spares: Iterable[Sequence[int]], leads: Iterable[tuple[int, int, int]]) -> str:
+    """Names with their views; for each view its spare names, the last for the rest; and where an action at a name can lead."""
+    view_of = dict(names)
+    leads = list(leads)
+    facts = [f"view({name},{view})." for name, view in view_of.items()]
+    for spare in spares:
+        facts += [f"spare({name})." for name in spare] + [f"after({r},{s})." for r, s in pairwise(spare)] + [f"rest({spare[-1]})."]
+    facts += [f"leads({s},{action},{x})." for s, action, x in leads]
+    facts += [f"shows({s},{action},{view})." for s, action, view in {(s, action, view_of[x]) for s, action, x in leads}]
+    return "\n".join(facts)
+
+
+def batch_facts(batch: int, steps: Iterable[tuple[int, int, Sequence[int], int | None]], links: Iterable[tuple[int, int]]) -> str:
+    """Steps, each with its view, the names it can be at, and the step of that view before it; and links with their actions."""
+    facts = []
+    for t, view, names, before in steps:
+        facts.append(f"node({batch},{t},{view}).")
+        facts += [f"may_be({t},{name})." for name in names]
+        facts += [f"follows({before},{t})."] if before is not None and len(names) > 1 else []
+    facts += [f"link({batch},{t},{action})." for t, action in links]
+    return "\n".join(facts)
+
+
+def read_names(model: Model) -> dict[int, int]:
+    """The name of each step that an answer set of names.lp speaks of."""
+    return {s.arguments[0].number: s.arguments[1].number for s in model.symbols(shown=True)}
+
+
+def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
+    """The map of the causal level that these labels of the first steps make, dstates numbered by first visit."""
+    number: dict[int, int] = {}
+    first: list[int] = []
+    for t, label in enumerate(labels):
+        if number.setdefault(label, len(number)) == len(first):
+            first.append(t)
+    found = tuple(number[label] for label in labels)
+    return SSHMap(found, tuple(DState(i, _view(trace, t)) for i, t in enumerate(first)), links_of(found, trace))
 
 
 def links_of(labels: Sequence[int], trace: Trace) -> tuple[tuple[int, str, int], ...]:

@@ -65,3 +65,33 @@ class Log:
             label = following
             found.append(label)
         return Replay(tuple(found), outcome)
+
+    def merged(self) -> tuple[int, ...]:
+        """Labels of a map of the whole trace, made greedily: not minimal, but at once.
+
+        Wherever the map does not know an action, the dstate among those that show what is seen is taken that then predicts most, if it
+        is not contradicted before the map knows no more; else a new one. So a link, once made, is never wrong.
+        """
+        actions, seen = self.actions, self.seen
+        shows = [seen[0]]
+        links: dict[tuple[int, int], int] = {}
+        labels = [0]
+        while len(labels) < len(seen):
+            t = len(labels)
+            key = (labels[-1], actions[t - 1])
+            best, most = [len(shows)], 0
+            for label in (s for s, view in enumerate(shows) if view == seen[t]):
+                links[key] = label
+                found = [label]
+                while (end := t + len(found)) < len(seen) and (following := links.get((found[-1], actions[end - 1]))) is not None:
+                    if shows[following] != seen[end]:
+                        break
+                    found.append(following)
+                else:
+                    if len(found) > most:
+                        best, most = found, len(found)
+            if not most:
+                shows.append(seen[t])
+            links[key] = best[0]
+            labels += best
+        return tuple(labels)

@@ -38,32 +38,26 @@ determinism, and that a dstate has one place, course and heading. A theory `with
 
 from __future__ import annotations
 
-import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Literal, TypeAlias
 
-import clingo
-
-from ssh_abduction import encodings, facts
+from ssh_abduction import facts
+from ssh_abduction.apart import Certificate, apartness, clique
+from ssh_abduction.engine import Engine, Found, Grounding, StepEngine, Stop, Stopped, Watch
 from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.named import AT_ONCE, NamedEngine
 from ssh_abduction.replay import Log, Outcome
+from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
 FIRST_PREFIX = 8  # steps; short enough that solving it costs next to nothing
-GROWTH = 1.25  # a prefix grows at least by this factor, so that there are few
 HELD_BACK = 1000  # maps kept until a prefix proves long enough; from there on they stream
 FIRST_PATHS = 8  # names for paths to begin with
-RESERVE = 0.2  # share of the time limit kept for finding any map of the whole trace
-POLL = 0.05  # seconds between looks at the clock and for Ctrl-C
-TICK = 0.5  # seconds between reports of progress while clingo is busy
-
-Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
+ALL = Speedups()
 
 
 class Status(Enum):
@@ -144,6 +138,8 @@ class Solution:
     steps      length of the trace
     prefix     how many of its first steps had to be given to clingo
     stopped    why the search ended before it was complete, else None
+    grounding  rules and atoms of the ground program that clingo solved
+    certificate  why no map has fewer dstates; None where the theory is without an axiom that this rests on
     partial    where no map of the whole trace was found: the best map of its first steps
     """
 
@@ -156,6 +152,8 @@ class Solution:
     steps: int
     prefix: int
     seconds: Seconds
+    grounding: Grounding
+    certificate: Certificate | None = None
     stopped: Stop | None = None
     partial: SSHMap | None = None
 
@@ -172,7 +170,7 @@ def solve(
     limit: float | None = None,
     maps: int = 100,
     memory: int | None = None,
-    prefixes: bool = True,
+    speedups: Speedups = ALL,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Solution:
     """Find the minimal maps of a trace.
@@ -181,13 +179,13 @@ def solve(
     limit        seconds of wall-clock time; when they are over, the best answer so far is returned
     maps         list at most so many maps; 0 lists all (take `Search` to stream them)
     memory       MiB of memory that the process may use at its peak before the search stops
-    prefixes     solve for prefixes and replay (the same answer, faster), or for the whole trace at once
+    speedups     which speed-ups are on; none changes the answer
     on_progress  is told now and then how far the search is
 
     Ctrl-C ends the search like a limit does. Raises TraceError or TheoryError where the trace lacks what the theory needs.
     Source: Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
-    search = Search(trace, theory, limit=limit, maps=maps, memory=memory, prefixes=prefixes, on_progress=on_progress)
+    search = Search(trace, theory, limit=limit, maps=maps, memory=memory, speedups=speedups, on_progress=on_progress)
     return search.solution(tuple(search))
 
 
@@ -205,7 +203,7 @@ class Search:
         limit: float | None = None,
         maps: int = 100,
         memory: int | None = None,
-        prefixes: bool = True,
+        speedups: Speedups = ALL,
         on_progress: Callable[[Progress], None] | None = None,
     ) -> None:
         for name, value in (("limit", limit), ("maps", maps), ("memory", memory)):
@@ -230,10 +228,18 @@ class Search:
         self._begun = False
         self._most = maps
         self._log = Log(trace, self.theory)
-        self._whole = not prefixes or bool(self.theory.without)
+        self._whole = not speedups.prefixes or bool(self.theory.without)
+        self._speedups = speedups
         self._on_progress = on_progress
-        self._watch = _Watch(limit, memory, self._report)
-        self._engine = _Engine(trace, self.theory, self._watch, min(FIRST_PATHS, facts.most_paths(trace, self.theory, len(trace))))
+        self._watch = Watch(limit, memory, self._report)
+        self._engine = self._new_engine()
+
+    def _new_engine(self) -> Engine:
+        theory = self.theory
+        if self._speedups.names and theory.level == "causal" and theory.prefer == ("dstates",) and not theory.without:
+            return NamedEngine(self.trace, theory, self._watch, self._log, self._speedups)
+        most = facts.most_paths(self.trace, theory, len(self.trace))
+        return StepEngine(self.trace, theory, self._watch, min(FIRST_PATHS, most) if self._speedups.path_names else most)
 
     @property
     def prefix(self) -> int:
@@ -246,6 +252,7 @@ class Search:
         self._begun = True
         self._watch.start()
         try:
+            self._merge()
             if self._find_cost():
                 for ssh_map in self._minimal_maps():
                     if self._most and self.count == self._most:
@@ -259,12 +266,13 @@ class Search:
                 self.complete = True
             elif self.status is Status.UNSATISFIABLE:
                 self.complete = True
-        except _Stopped as stop:
+        except Stopped as stop:
             self.stopped = stop.reason
         except KeyboardInterrupt:
             self.stopped = "interrupted"
         finally:
             self._watch.stop()
+        self._raise_bound(self._engine.bound)
         if self.stopped and self.status is not Status.OPTIMAL:
             if self.best is None and self.stopped == "time limit":
                 self._salvage()
@@ -285,7 +293,7 @@ class Search:
             self._watch.start()
         try:
             self._watch.check()
-        except _Stopped as stop:
+        except Stopped as stop:
             self.stopped = stop.reason
             return True
         return False
@@ -301,10 +309,24 @@ class Search:
             theory=self.theory,
             steps=len(self.trace),
             prefix=self.prefix,
+            grounding=self._engine.grounding,
+            certificate=self._certificate(),
             seconds=Seconds(self._watch.elapsed(), self._engine.ground_seconds, self._engine.solve_seconds),
             stopped=self.stopped,
             partial=None if self.best else self.partial,
         )
+
+    def _certificate(self) -> Certificate | None:
+        """A clique of steps that are pairwise apart, in the prefix that clingo was given, and the bound that clingo adds to it."""
+        if {"functional_view", "deterministic"} & set(self.theory.without):
+            return None
+        if isinstance(self._engine, NamedEngine) and self._engine.clique:
+            steps = self._engine.clique
+        else:
+            number: dict[object, int] = {}
+            views = [number.setdefault(step.view, len(number)) for step in self.trace.steps[: min(max(self.prefix, 1), AT_ONCE)]]
+            steps = clique(apartness(views, self._log.actions[: len(views) - 1]), views)
+        return Certificate(tuple(steps), tuple(range(len(steps), self.bound.dstates or 0)))
 
     def _find_cost(self) -> bool:
         """Extend the prefix until a minimal map of it replays to the end. False where the prefix has no map."""
@@ -317,16 +339,27 @@ class Search:
                 self.status = Status.UNSATISFIABLE
                 return False
             self.partial = minimal.map
-            if self.theory.priorities:
-                self.bound = Bound(**{self.theory.priorities[0]: minimal.cost[0]})
+            self._raise_bound(minimal.cost[0] if minimal.cost else None)
             replayed = self._log.replay(minimal.map.labels)
             if replayed.outcome is Outcome.PREDICTED:
                 self._keep(minimal, replayed.labels)
                 self.status = Status.OPTIMAL
                 return True
-            size = self._extended(len(replayed.labels))
+            size = self._engine.next_size(len(replayed.labels))
 
-    def _minimise(self) -> _Found | None:
+    def _raise_bound(self, proven: int | None) -> None:
+        first = self.theory.priorities[0] if self.theory.priorities else None
+        if first and proven is not None and proven > (getattr(self.bound, first) or 0):
+            self.bound = Bound(**{first: proven})
+
+    def _merge(self) -> None:
+        """A causal map at once, that clingo has to better."""
+        theory = self.theory
+        if self._speedups.greedy and theory.level == "causal" and not theory.without:
+            found = facts.causal_map(self._log.merged(), self.trace)
+            self._keep(Found(found, (len(found.dstates),) if theory.prefer else ()), found.labels)
+
+    def _minimise(self) -> Found | None:
         """A minimal map of the prefix, or None where it has no map. Better maps of the whole trace are kept on the way."""
         while True:
             minimal = None
@@ -359,7 +392,7 @@ class Search:
             return cost[0]
         return min(legs, cost[0] // (1 if self.theory.all_on_paths else 2))
 
-    def _keep(self, found: _Found, labels: tuple[int, ...]) -> None:
+    def _keep(self, found: Found, labels: tuple[int, ...]) -> None:
         self.best = replace(found.map, labels=labels)
         self._cost = found.cost
         self._watch.use_reserve()
@@ -373,7 +406,7 @@ class Search:
             stuck = 0
             streaming = False
             try:
-                for found in self._engine.maps_of_cost(self._cost):
+                for found in self._engine.maps_of_cost(self._cost, self._most and self._most + 1):
                     replayed = self._log.replay(found.map.labels)
                     if replayed.outcome is not Outcome.PREDICTED:
                         stuck = max(stuck, len(replayed.labels))
@@ -391,7 +424,7 @@ class Search:
                         streaming = True
                         yield from held
                         held = []
-            except _Stopped:
+            except Stopped:
                 yield from held  # they replay at the proven cost: they are minimal
                 raise
             if not stuck:
@@ -399,18 +432,14 @@ class Search:
                 return
             if streaming:
                 streamed.append(self.prefix)
-            self._engine.grow(self._extended(stuck))
+            self._engine.grow(self._engine.next_size(stuck))
             self._name_paths(self._cost)
-
-    def _extended(self, failed: int) -> int:
-        """A longer prefix that holds the step at which a replay failed."""
-        return min(len(self.trace), max(failed + 1, int(self.prefix * GROWTH)))
 
     def _salvage(self) -> None:
         """In the last part of the time limit, look for any map of the whole trace."""
         self._watch.use_reserve()
         self._watch.start()
-        with suppress(_Stopped, KeyboardInterrupt):
+        with suppress(Stopped, KeyboardInterrupt):
             self._engine.grow(len(self.trace))
             self.status = Status.OPTIMAL if self._minimise() else Status.UNSATISFIABLE
         self._watch.stop()
@@ -422,149 +451,3 @@ class Search:
     def _report(self) -> None:
         if self._on_progress is not None:
             self._on_progress(Progress(self.prefix, len(self.trace), self._best_cost(), self.bound, self.count, self._watch.elapsed()))
-
-
-@dataclass(frozen=True, slots=True)
-class _Found:
-    """A map of a prefix, and what it costs: the preferred counts, first to last."""
-
-    map: SSHMap
-    cost: tuple[int, ...]
-
-
-class _Stopped(Exception):  # noqa: N818 - not an error
-    def __init__(self, reason: Stop) -> None:
-        self.reason = reason
-
-
-class _Watch:
-    """The limits of a search: `check` raises when one is over. Time that the caller of a stream takes does not count."""
-
-    def __init__(self, limit: float | None, memory: int | None, on_tick: Callable[[], None]) -> None:
-        self._on_tick = on_tick
-        self._next_tick = TICK
-        self._limit = limit
-        self._allowed = None if limit is None else limit * (1 - RESERVE)
-        self._memory = memory
-        self._started: float | None = None
-        self._spent = 0.0
-        self.interrupted = False
-
-    def start(self) -> None:
-        self._started = time.perf_counter()
-
-    @property
-    def running(self) -> bool:
-        return self._started is not None
-
-    def use_reserve(self) -> None:
-        """From now on the whole time limit may be used."""
-        self._allowed = self._limit
-
-    def stop(self) -> None:
-        self._spent, self._started = self.elapsed(), None
-
-    def elapsed(self) -> float:
-        return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
-
-    def check(self) -> None:
-        if self.interrupted:
-            raise _Stopped("interrupted")
-        if self.elapsed() > self._next_tick:
-            self._next_tick = self.elapsed() + TICK
-            self._on_tick()
-        if self._allowed is not None and self.elapsed() > self._allowed:
-            raise _Stopped("time limit")
-        if self._memory is not None and peak_memory() > self._memory:
-            raise _Stopped("memory limit")
-
-
-def peak_memory() -> float:
-    """The most memory this process has used, in MiB."""
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
-
-
-class _Engine:
-    """One clingo control that holds the axioms for a growing prefix of a trace."""
-
-    def __init__(self, trace: Trace, theory: Theory, watch: _Watch, paths: int) -> None:
-        self.size = 0
-        self.paths = paths  # names for paths
-        self._asked: int | None = None  # the step that is the last one, as far as clingo knows
-        self.ground_seconds = 0.0
-        self.solve_seconds = 0.0
-        self._trace = trace
-        self._theory = theory
-        self._watch = watch
-        self._control = clingo.Control(["--warn=none"])
-        for name in facts.encoding_names(theory):
-            self._control.load(encodings.path(name))
-        self._control.add("base", [], facts.theory_facts(theory, paths))
-
-    def with_paths(self, paths: int) -> _Engine:
-        """Another control for the same prefix, with more names for paths."""
-        engine = _Engine(self._trace, self._theory, self._watch, paths)
-        engine.ground_seconds, engine.solve_seconds = self.ground_seconds, self.solve_seconds
-        engine.grow(self.size)
-        return engine
-
-    def grow(self, size: int) -> None:
-        """Let the prefix have `size` steps."""
-        began = time.perf_counter()
-        control = self._control
-        try:
-            if self.size == 0:
-                control.ground([("base", [])])
-            while self.size < size:
-                self._watch.check()
-                part = f"steps_from_{self.size}"
-                stop = min(size, self.size + (8 if self.size < 32 else 1))
-                control.add(part, [], facts.trace_facts(self._trace, self._theory, self.size, stop))
-                control.ground([(part, []), *(("step", facts.step_number(t)) for t in range(self.size, stop))])
-                self.size = stop
-            if self._asked != size - 1:
-                control.ground([("check", facts.step_number(size - 1))])
-                if self._asked is not None:
-                    control.release_external(facts.query(self._asked))
-                control.assign_external(facts.query(size - 1), True)
-                self._asked = size - 1
-        finally:
-            self.ground_seconds += time.perf_counter() - began
-
-    def improving_maps(self) -> Iterator[_Found]:
-        """Maps of the prefix, each better than the one before; where the iteration ends, the last one is minimal."""
-        return self._solve("opt" if self._theory.priorities else "ignore", 0 if self._theory.priorities else 1)
-
-    def maps_of_cost(self, cost: tuple[int, ...]) -> Iterator[_Found]:
-        """All maps of the prefix that cost this and no more."""
-        bound = ",".join(map(str, cost))
-        return self._solve(f"enum,{bound}" if bound else "ignore", 0)
-
-    def _solve(self, mode: str, models: int) -> Iterator[_Found]:
-        configuration: Any = self._control.configuration.solve
-        configuration.opt_mode = mode
-        configuration.models = models
-        configuration.project = "project" if mode != "opt" else "no"
-        began = time.perf_counter()
-        with self._control.solve(yield_=True, async_=True) as handle:
-            try:
-                while True:
-                    handle.resume()
-                    while not handle.wait(POLL):
-                        self._watch.check()
-                    self._watch.check()
-                    model = handle.model()
-                    if model is None:
-                        if handle.get().interrupted:
-                            raise _Stopped("interrupted")
-                        break
-                    found = _Found(facts.read_map(model, self._trace, self._theory), tuple(model.cost))
-                    self.solve_seconds += time.perf_counter() - began
-                    yield found
-                    began = time.perf_counter()
-            finally:
-                handle.cancel()
-                self.solve_seconds += max(0.0, time.perf_counter() - began)

@@ -20,8 +20,9 @@ from hypothesis import given, settings
 from strategies import theories, traces
 from worlds import TOURS, drive, rectangle, written
 
+import ssh_abduction.engine as engine_module
 import ssh_abduction.solver as solver_module
-from ssh_abduction import Progress, Search, SolverError, SSHMap, Status, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction import Progress, Search, SolverError, Speedups, SSHMap, Status, Theory, TheoryError, Trace, TraceError, solve
 from ssh_abduction.checker import check
 from ssh_abduction.explain import Interrupted, explain
 from ssh_abduction.facts import links_of
@@ -42,12 +43,17 @@ def wandering(seed: int, rooms: int, length: int, views: int) -> Trace:
     return Trace.from_steps([*seen, room % views], done)
 
 
+def too_hard() -> Trace:
+    """Two views, sixty rooms: far more than a proof in seconds can do."""
+    return wandering(3, rooms=60, length=1500, views=2)
+
+
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
 @pytest.mark.parametrize("tour", TOURS)
 def test_prefixes_give_what_solving_at_once_gives(tour: str, theory: Theory) -> None:
     world, place, heading, actions = TOURS[tour]
     trace = drive(world, place, heading, actions, stars=theory.level == "topological")
-    by_prefix, at_once = solve(trace, theory, maps=0), solve(trace, theory, maps=0, prefixes=False)
+    by_prefix, at_once = solve(trace, theory, maps=0), solve(trace, theory, maps=0, speedups=Speedups(prefixes=False))
     assert set(by_prefix.maps) == set(at_once.maps)
     assert (by_prefix.cost, by_prefix.bound, by_prefix.complete) == (at_once.cost, at_once.bound, True)
     assert at_once.prefix == len(trace)
@@ -56,7 +62,7 @@ def test_prefixes_give_what_solving_at_once_gives(tour: str, theory: Theory) -> 
 @pytest.mark.parametrize("seed", range(6))
 def test_prefixes_of_random_machines(seed: int) -> None:
     trace = wandering(seed, rooms=4, length=40, views=3)
-    by_prefix, at_once = (solve(trace, Theory.causal(), maps=0, prefixes=p) for p in (True, False))
+    by_prefix, at_once = (solve(trace, Theory.causal(), maps=0, speedups=Speedups(prefixes=p)) for p in (True, False))
     assert set(by_prefix.maps) == set(at_once.maps)
     assert len(set(by_prefix.maps)) == by_prefix.count
 
@@ -68,10 +74,10 @@ def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
     trace, theory = case
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(solver_module, "FIRST_PREFIX", 1)
-        patch.setattr(solver_module, "GROWTH", 1.0)
+        patch.setattr(engine_module, "GROWTH", 1.0)
         patch.setattr(solver_module, "FIRST_PATHS", 1)
         by_prefix = solve(trace, theory, maps=0)
-    at_once = solve(trace, theory, maps=0, prefixes=False)
+    at_once = solve(trace, theory, maps=0, speedups=Speedups(prefixes=False))
     assert set(by_prefix.maps) == set(at_once.maps)
     assert by_prefix.count == len(set(by_prefix.maps)) == at_once.count
     assert by_prefix.status == at_once.status
@@ -81,7 +87,7 @@ def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
 def test_streaming_lists_no_map_twice_and_misses_none(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """With nothing held back, maps stream from a prefix that is too short for others."""
     trace = wandering(seed, rooms=5, length=30, views=3)
-    at_once = solve(trace, Theory.causal(), maps=0, prefixes=False)
+    at_once = solve(trace, Theory.causal(), maps=0, speedups=Speedups(prefixes=False))
     monkeypatch.setattr(solver_module, "FIRST_PREFIX", 2)
     monkeypatch.setattr(solver_module, "HELD_BACK", 1)
     streamed = solve(trace, Theory.causal(), maps=0)
@@ -148,7 +154,7 @@ def test_nothing_preferred_means_all_consistent_maps() -> None:
 
 
 def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
-    trace = wandering(3, rooms=12, length=80, views=2)
+    trace = too_hard()
     solution = solve(trace, Theory.causal(), limit=3)
     assert solution.stopped == "time limit"
     assert solution.status is Status.FEASIBLE
@@ -168,7 +174,7 @@ def test_no_time_at_all_is_unknown_not_unsatisfiable() -> None:
 
 def test_time_limit_while_listing_keeps_the_proof() -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=())
-    solution = solve(rectangle(24), theory, limit=1, maps=0)
+    solution = solve(rectangle(24), theory, limit=3, maps=0)
     assert (solution.status, solution.complete, solution.stopped) == (Status.OPTIMAL, False, "time limit")
     assert solution.count > 0
 
@@ -183,10 +189,10 @@ def test_ctrl_c_leaves_the_best_map() -> None:
     program = textwrap.dedent("""
         import sys
         sys.path.insert(0, sys.argv[1])
-        from test_solver import wandering
+        from test_solver import too_hard
         from ssh_abduction import Theory, solve
         print("ready", flush=True)
-        solution = solve(wandering(3, rooms=9, length=150, views=2), Theory.causal())
+        solution = solve(too_hard(), Theory.causal())
         print(solution.stopped, solution.status.value, solution.bound.dstates is not None)
     """)
     with subprocess.Popen([sys.executable, "-c", program, os.path.dirname(__file__)], stdout=subprocess.PIPE, text=True) as process:
@@ -316,24 +322,26 @@ def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
     trace = drive(*TOURS["comb"])
     theory = Theory.topological().resolve(trace)
 
-    class Impatient(solver_module._Watch):
+    class Impatient(solver_module.Watch):
         left = 100
 
         def check(self) -> None:
             self.left -= 1
             if not self.left:
-                raise solver_module._Stopped("time limit")
+                raise solver_module.Stopped("time limit")
 
     watch = Impatient(None, None, lambda: None)
-    engine = solver_module._Engine(trace, theory, watch, paths=10)
+    engine = solver_module.StepEngine(trace, theory, watch, paths=10)
     engine.grow(4)
     watch.left = 2
-    with pytest.raises(solver_module._Stopped):
+    with pytest.raises(solver_module.Stopped):
         engine.grow(len(trace))
     assert 4 < engine.size < len(trace)
     engine.grow(len(trace))
     minimal = list(engine.improving_maps())[-1]
-    assert {found.map for found in engine.maps_of_cost(minimal.cost)} == set(solve(trace, theory, maps=0, prefixes=False).maps)
+    assert {found.map for found in engine.maps_of_cost(minimal.cost, 0)} == set(
+        solve(trace, theory, maps=0, speedups=Speedups(prefixes=False)).maps
+    )
 
 
 def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -341,9 +349,9 @@ def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPa
     search = Search(drive(*TOURS["comb"]), theory, maps=0)
     honest = search._engine.maps_of_cost
 
-    def interrupted(cost: tuple[int, ...]) -> Iterator[object]:
-        yield from itertools.islice(honest(cost), 200)
-        raise solver_module._Stopped("interrupted")
+    def interrupted(cost: tuple[int, ...], enough: int) -> Iterator[object]:
+        yield from itertools.islice(honest(cost, enough), 200)
+        raise solver_module.Stopped("interrupted")
 
     monkeypatch.setattr(search._engine, "maps_of_cost", interrupted)
     maps = tuple(search)

@@ -1,0 +1,95 @@
+"""Traces to measure on: random walks in grid mazes and in random Moore machines. The same seed gives the same trace.
+
+>>> walk = maze(5, 5, steps=1600, seed=0)
+>>> len(walk.trace), len(set(walk.truth))
+(1601, 100)
+"""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+
+from ssh_abduction import Trace
+
+HEADINGS = ((0, 1), (1, 0), (0, -1), (-1, 0))  # north, east, south, west
+TURNS = {"right": 1, "around": 2, "left": 3}
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A trace, and the true state at each of its steps."""
+
+    trace: Trace
+    truth: tuple[object, ...]
+
+
+def maze(width: int, height: int, *, steps: int, seed: int, loops: float = 0.1, stars: bool = False) -> Walk:
+    """A random walk of so many actions in a maze of corridors: a random spanning tree of the grid, and each further wall open by chance.
+
+    A state is a cell and a heading, a view the openings ahead, right, back and left. Where the way ahead is open the robot
+    travels half of the time; else it turns. It turns around only where it cannot travel.
+    """
+    chance = random.Random(seed)
+    walls = [((x, y), (x + dx, y + dy)) for x in range(width) for y in range(height) for dx, dy in ((1, 0), (0, 1))]
+    walls = [(a, b) for a, b in walls if b[0] < width and b[1] < height]
+    chance.shuffle(walls)
+    root = {(x, y): (x, y) for x in range(width) for y in range(height)}
+
+    def found(cell: tuple[int, int]) -> tuple[int, int]:
+        while root[cell] != cell:
+            cell = root[cell]
+        return cell
+
+    doors: set[tuple[tuple[int, int], tuple[int, int]]] = set()
+    for a, b in walls:
+        if found(a) != found(b) or chance.random() < loops:
+            root[found(a)] = found(b)
+            doors |= {(a, b), (b, a)}
+
+    def ahead(x: int, y: int, heading: int) -> tuple[int, int]:
+        return x + HEADINGS[heading % 4][0], y + HEADINGS[heading % 4][1]
+
+    x, y = chance.randrange(width), chance.randrange(height)
+    heading = chance.randrange(4)
+    seen: list[list[int]] = []
+    truth: list[object] = []
+    done: list[str] = []
+    for step in range(steps + 1):
+        seen.append([int(((x, y), ahead(x, y, heading + k)) in doors) for k in range(4)])
+        truth.append((x, y, heading))
+        if step == steps:
+            break
+        action = chance.choice(["travel", "travel", "right", "left"] if seen[-1][0] else ["right", "left", "around"])
+        if action == "travel":
+            x, y = ahead(x, y, heading)
+        else:
+            heading = (heading + TURNS[action]) % 4
+        done.append(action)
+    views = ["".join(map(str, openings)) for openings in seen]
+    return Walk(Trace.from_steps(views, done, stars=seen if stars else None, name=f"maze {width} x {height}, seed {seed}"), tuple(truth))
+
+
+def moore(states: int, views: int, *, steps: int, seed: int, actions: int = 2) -> Walk:
+    """A random walk in a random Moore machine: links and views drawn evenly, save that each view is there and a random tour of all states is possible."""
+    chance = random.Random(seed)
+    shown = [*range(views), *(chance.randrange(views) for _ in range(states - views))]
+    chance.shuffle(shown)
+    follow = [[chance.randrange(states) for _ in range(actions)] for _ in range(states)]
+    tour = chance.sample(range(states), states)
+    for here, there in zip(tour, [*tour[1:], tour[0]], strict=True):
+        follow[here][chance.randrange(actions)] = there
+    state, truth, done = 0, [0], []
+    for _ in range(steps):
+        action = chance.randrange(actions)
+        state = follow[state][action]
+        done.append({"name": f"a{action}"})
+        truth.append(state)
+    return Walk(Trace.from_steps([f"v{shown[s]}" for s in truth], done, name=f"moore {states}/{views}, seed {seed}"), tuple(truth))
+
+
+def rectangle(circuits: int) -> Walk:
+    """The notched rectangle of Kuipers & Beeson (2002), so many times round: eight states, four views."""
+    steps = 8 * circuits
+    trace = Trace.from_steps([f"v{i % 4}" for i in range(steps + 1)], [("right", "travel")[i % 2] for i in range(steps)])
+    return Walk(trace, tuple(i % 8 for i in range(steps + 1)))

@@ -1,0 +1,148 @@
+"""Which steps cannot be one dstate, whatever the map: a lower bound on dstates that anybody can check.
+
+Two steps are *apart* if some actions, done from both, lead to different views: as a dstate has one view and actions are
+deterministic, they are different dstates. On a trace, what was done from a step is how the trace goes on; so the steps are apart if
+their continuations show different views before, or when, the actions differ. Steps that are pairwise apart, a *clique*, need as many
+dstates as they are, in every theory that holds the axioms functional_view and deterministic. A `Certificate` is such a clique.
+
+>>> from ssh_abduction import Trace, solve
+>>> trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
+>>> solve(trace).certificate.clique
+(0, 1, 2, 3)
+>>> solve(trace).certificate.words(trace)[0, 2]
+('travel',)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.errors import SolverError, brief
+from ssh_abduction.trace import Trace
+
+SWAPS = 60  # attempts to better the clique, for each view
+
+Matrix = NDArray[np.bool_]
+
+
+def apartness(seen: Sequence[int], actions: Sequence[int]) -> Matrix:
+    """Which pairs of steps are apart: a symmetric matrix, steps x steps, from what was seen at each and done after each.
+
+    Computed from the end of the trace to its start: two steps are apart if they show different things, or if the same action leads
+    to steps that are apart.
+    """
+    shown, done = np.asarray(seen), np.asarray(actions)
+    steps = len(shown)
+    apart = np.empty((steps, steps), dtype=bool)
+    for i in range(steps - 1, -1, -1):
+        np.not_equal(shown, shown[i], out=apart[i])
+        if i < steps - 1:
+            apart[i, :-1] |= (done == done[i]) & apart[i + 1, 1:]
+    return apart
+
+
+def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
+    """A large clique of steps, in order. As steps with different views are always apart, each view has a clique of its own."""
+    shown = np.asarray(seen)
+    found: list[int] = []
+    for view in range(int(shown.max()) + 1):
+        steps = np.flatnonzero(shown == view)
+        found += [int(steps[i]) for i in _clique(apart[np.ix_(steps, steps)])]
+    return sorted(found)
+
+
+def _clique(apart: Matrix) -> list[int]:
+    """Greedily the step that is apart from most of those left, then swaps: take some out, fill up again, keep what is no smaller."""
+    random = np.random.default_rng(0)
+    best = _filled(apart, [], random)
+    for _ in range(SWAPS if 1 < len(best) < len(apart) else 0):
+        kept = random.permutation(best)[random.integers(1, len(best)) :]
+        other = _filled(apart, kept.tolist(), random)
+        best = other if len(other) >= len(best) else best
+    return best
+
+
+def _filled(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:
+    """A clique that no step can be added to."""
+    left = np.flatnonzero(apart[kept].all(axis=0)) if kept else np.arange(len(apart))
+    found = list(kept)
+    inner = apart[np.ix_(left, left)]
+    while len(left):
+        best = int((inner.sum(axis=1) + random.random(len(left))).argmax())
+        found.append(int(left[best]))
+        stay = np.flatnonzero(inner[best])
+        left, inner = left[stay], inner[np.ix_(stay, stay)]
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """Why no map has fewer dstates.
+
+    clique   steps that are pairwise apart, so that each is a dstate of its own: checked by `check`, without a solver
+    refuted  numbers of dstates, from the size of the clique up, for which clingo found that there is no map
+    """
+
+    clique: tuple[int, ...]
+    refuted: tuple[int, ...] = ()
+
+    @property
+    def bound(self) -> int:
+        """The number of dstates that every map has at least."""
+        return len(self.clique) + len(self.refuted)
+
+    def words(self, trace: Trace) -> dict[tuple[int, int], tuple[str, ...]]:
+        """For each pair of steps of the clique the common actions that lead from them to different views. Raises SolverError."""
+        return {pair: _word(trace, *pair) for pair in combinations(self.clique, 2)}
+
+    def to_dict(self, trace: Trace) -> dict[str, Any]:
+        """Plain data. Pairs that show different views at once need no word, and are left out."""
+        words = [[i, j, list(word)] for (i, j), word in self.words(trace).items() if word]
+        return {"clique": list(self.clique), "words": words, "refuted": list(self.refuted)}
+
+    @staticmethod
+    def check(data: Any, trace: Trace) -> Certificate:
+        """The certificate that `to_dict` wrote, after checking each of its words on the trace. Raises SolverError where it is wrong."""
+        if not isinstance(data, Mapping) or not isinstance(data.get("clique"), list):
+            raise SolverError(f"certificate: expected an object with a clique, got {brief(data)}; solve the trace again")
+        steps, refuted = data["clique"], data.get("refuted", [])
+        for step in steps:
+            if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < len(trace):
+                raise SolverError(f"certificate: clique: expected steps of the trace, 0 to {len(trace) - 1}, got {brief(step)}")
+        if len(set(steps)) < len(steps):
+            raise SolverError("certificate: clique: expected each step once")
+        if refuted != list(range(len(steps), len(steps) + len(refuted))):
+            raise SolverError(f"certificate: refuted: expected the numbers from {len(steps)} up, without a gap, got {brief(refuted)}")
+        words = {frozenset(entry[:2]): entry[2] for entry in data.get("words", [])}
+        for i, j in combinations(steps, 2):
+            _apart_by(trace, i, j, words.get(frozenset((i, j)), []))
+        return Certificate(tuple(steps), tuple(refuted))
+
+
+def _apart_by(trace: Trace, i: int, j: int, word: Sequence[str]) -> None:
+    """Check that these actions were done from both steps, and led to different views."""
+    for k, name in enumerate(word):
+        for step in (i, j):
+            action = trace.steps[step + k].action if step + k < len(trace) else None
+            if action is None or action.name != name:
+                was = brief(action.name) if action else "the end of the trace"
+                raise SolverError(f"certificate: steps {i} and {j}: expected {brief(name)} after step {step + k}, got {was}")
+    if trace.steps[i + len(word)].view == trace.steps[j + len(word)].view:
+        raise SolverError(f"certificate: steps {i} and {j}: expected different views after {brief(list(word))}, got the same")
+
+
+def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:
+    word: list[str] = []
+    while True:
+        here, there = trace.steps[i + len(word)], trace.steps[j + len(word)]
+        if here.view != there.view:
+            return tuple(word)
+        if here.action is None or there.action is None or here.action.name != there.action.name:
+            raise SolverError(f"clique: expected steps that are apart, got {i} and {j}, which may be one dstate")
+        word.append(here.action.name)

@@ -1,0 +1,226 @@
+"""Engines: what asks clingo for maps of a growing prefix of a trace, and the limits that they keep."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias, TypeVar
+
+import clingo
+
+from ssh_abduction import encodings, facts
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Trace
+
+RESERVE = 0.2  # share of the time limit kept for finding any map of the whole trace
+GROWTH = 1.25  # a prefix grows at least by this factor, so that there are few
+POLL = 0.05  # seconds between looks at the clock and for Ctrl-C
+TICK = 0.5  # seconds between reports of progress while clingo is busy
+
+Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A map of a prefix, and what it costs: the preferred counts, first to last."""
+
+    map: SSHMap
+    cost: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Grounding:
+    """How large a ground program is."""
+
+    rules: int
+    atoms: int
+
+
+class Stopped(Exception):  # noqa: N818 - not an error
+    def __init__(self, reason: Stop) -> None:
+        self.reason = reason
+
+
+class Watch:
+    """The limits of a search: `check` raises when one is over. Time that the caller of a stream takes does not count."""
+
+    def __init__(self, limit: float | None, memory: int | None, on_tick: Callable[[], None]) -> None:
+        self._on_tick = on_tick
+        self._next_tick = TICK
+        self._limit = limit
+        self._allowed = None if limit is None else limit * (1 - RESERVE)
+        self._memory = memory
+        self._started: float | None = None
+        self._spent = 0.0
+        self.interrupted = False
+
+    def start(self) -> None:
+        self._started = time.perf_counter()
+
+    @property
+    def running(self) -> bool:
+        return self._started is not None
+
+    def use_reserve(self) -> None:
+        """From now on the whole time limit may be used."""
+        self._allowed = self._limit
+
+    def stop(self) -> None:
+        self._spent, self._started = self.elapsed(), None
+
+    def elapsed(self) -> float:
+        return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
+
+    def check(self) -> None:
+        if self.interrupted:
+            raise Stopped("interrupted")
+        if self.elapsed() > self._next_tick:
+            self._next_tick = self.elapsed() + TICK
+            self._on_tick()
+        if self._allowed is not None and self.elapsed() > self._allowed:
+            raise Stopped("time limit")
+        if self._memory is not None and peak_memory() > self._memory:
+            raise Stopped("memory limit")
+
+
+def peak_memory() -> float:
+    """The most memory this process has used, in MiB."""
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
+
+
+Answer = TypeVar("Answer")
+
+
+class Engine:
+    """One clingo control that holds the axioms for the first `size` steps of a trace.
+
+    bound   lower bound, proven, on the count that is preferred first; None where nothing is known before a search ends
+    paths   how many names for paths there are
+    """
+
+    def __init__(self, trace: Trace, theory: Theory, watch: Watch, paths: int = 0) -> None:
+        self.size = 0
+        self.paths = paths
+        self.bound: int | None = None
+        self.grounding = Grounding(0, 0)  # of the last call of clingo that came to an end
+        self.ground_seconds = 0.0
+        self.solve_seconds = 0.0
+        self._trace = trace
+        self._theory = theory
+        self._watch = watch
+        self._control = clingo.Control(["--warn=none"])
+
+    def grow(self, size: int) -> None:
+        """Let the prefix have `size` steps."""
+        raise NotImplementedError
+
+    def next_size(self, failed: int) -> int:
+        """The size to grow to when the maps of the prefix do not explain step `failed`."""
+        return min(len(self._trace), max(failed + 1, int(self.size * GROWTH)))
+
+    def with_paths(self, paths: int) -> Engine:
+        """Another engine for the same prefix, with more names for paths."""
+        raise NotImplementedError
+
+    def improving_maps(self) -> Iterator[Found]:
+        """Maps of the prefix, each better than the one before; where the iteration ends, the last one is minimal."""
+        raise NotImplementedError
+
+    def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
+        """All maps of the prefix that cost this and no more; or `enough` of them, unless that is 0."""
+        raise NotImplementedError
+
+    def _answers(
+        self,
+        read: Callable[[clingo.Model], Answer],
+        mode: str,
+        models: int,
+        *,
+        assumptions: Sequence[tuple[clingo.Symbol, bool]] = (),
+        conflicts: int = -1,
+        on_bound: Callable[[Sequence[int]], None] | None = None,
+    ) -> Generator[Answer, None, bool]:
+        """What clingo answers, read at once. Returns whether it came to an end, and not to the limit of conflicts."""
+        configuration: Any = self._control.configuration.solve
+        configuration.opt_mode = mode
+        configuration.models = models
+        configuration.project = "project" if not mode.startswith("opt") else "no"
+        configuration.solve_limit = f"{conflicts},-1"
+        began = time.perf_counter()
+        with self._control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound) as handle:
+            try:
+                while True:
+                    handle.resume()
+                    while not handle.wait(POLL):
+                        self._watch.check()
+                    self._watch.check()
+                    model = handle.model()
+                    if model is None:
+                        result = handle.get()
+                        if result.interrupted and conflicts < 0:
+                            raise Stopped("interrupted")
+                        program = self._control.statistics["problem"]["lp"]
+                        self.grounding = Grounding(int(program["rules"]), int(program["atoms"]))
+                        return bool(result.exhausted)
+                    answer = read(model)
+                    self.solve_seconds += time.perf_counter() - began
+                    yield answer
+                    began = time.perf_counter()
+            finally:
+                handle.cancel()
+                self.solve_seconds += max(0.0, time.perf_counter() - began)
+
+
+class StepEngine(Engine):
+    """The encodings of all levels: a dstate is named by the first step at it."""
+
+    def __init__(self, trace: Trace, theory: Theory, watch: Watch, paths: int) -> None:
+        super().__init__(trace, theory, watch, paths)
+        self._asked: int | None = None  # the step that is the last one, as far as clingo knows
+        for name in facts.encoding_names(theory):
+            self._control.load(encodings.path(name))
+        self._control.add("base", [], facts.theory_facts(theory, paths))
+
+    def with_paths(self, paths: int) -> StepEngine:
+        engine = StepEngine(self._trace, self._theory, self._watch, paths)
+        engine.ground_seconds, engine.solve_seconds = self.ground_seconds, self.solve_seconds
+        engine.grow(self.size)
+        return engine
+
+    def grow(self, size: int) -> None:
+        began = time.perf_counter()
+        control = self._control
+        try:
+            if self.size == 0:
+                control.ground([("base", [])])
+            while self.size < size:
+                self._watch.check()
+                part = f"steps_from_{self.size}"
+                stop = min(size, self.size + (8 if self.size < 32 else 1))
+                control.add(part, [], facts.trace_facts(self._trace, self._theory, self.size, stop))
+                control.ground([(part, []), *(("step", facts.step_number(t)) for t in range(self.size, stop))])
+                self.size = stop
+            if self._asked != size - 1:
+                control.ground([("check", facts.step_number(size - 1))])
+                if self._asked is not None:
+                    control.release_external(facts.query(self._asked))
+                control.assign_external(facts.query(size - 1), True)
+                self._asked = size - 1
+        finally:
+            self.ground_seconds += time.perf_counter() - began
+
+    def improving_maps(self) -> Iterator[Found]:
+        return self._answers(self._read, *(("opt", 0) if self._theory.priorities else ("ignore", 1)))
+
+    def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
+        bound = ",".join(map(str, cost))
+        return self._answers(self._read, f"enum,{bound}" if bound else "ignore", 0)
+
+    def _read(self, model: clingo.Model) -> Found:
+        return Found(facts.read_map(model, self._trace, self._theory), tuple(model.cost))

@@ -1,0 +1,222 @@
+"""An engine for the causal theory on long traces: the dstates have names before clingo is asked.
+
+Steps that are pairwise apart (`apart.py`) are pinned to names of their own. That bounds the number of dstates from below, leaves no
+two ways to name these dstates, and lets every other step choose only among the names that it is not apart from. A view has a few
+spare names, at the cost of one dstate each, and a *rest*, which stands for all dstates of the view beyond them.
+
+*Claim.* A map of minimal cost that uses no rest is a minimal map, and its cost is the minimum.
+*Proof.* Name the dstates of any map: those of the pinned steps as pinned, the others by spare names of their view as far as these
+reach, then by the rest. This keeps every rule of names.lp, as a rest asks nothing of the steps at it, and costs at most as many spare
+names as the map has dstates beyond the clique. So the cost found is a lower bound; a map without a rest is a map of the trace, and
+reaches it. ∎ A minimal answer that does use a rest is asked for again, with one more spare name for its view.
+
+Not every step is needed. The control starts with the links of the pinned steps; an answer is followed along the trace, and the links
+at which it fails are added, until one holds everywhere. That is a relaxation until then, so its bounds hold. Where clingo does not
+answer soon, what is missing is rather more knowledge than less, and all links are given at once.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+
+import clingo
+import numpy as np
+
+from ssh_abduction import encodings, facts
+from ssh_abduction.apart import apartness, clique
+from ssh_abduction.engine import Engine, Found, Watch
+from ssh_abduction.replay import Log
+from ssh_abduction.speedups import Speedups
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Trace
+
+AT_ONCE = 8000  # steps of a trace that is given whole; the matrix of pairs has the square of that many bytes
+FIRST_PREFIXES = 32  # steps of a prefix that is tried before that
+HELD_BACK = 100  # maps that are kept until all links are given; then they stream
+PATIENCE = 2000  # conflicts after which all links are given
+
+
+class NamedEngine(Engine):
+    """The causal theory, fewest dstates, with names given beforehand."""
+
+    def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
+        super().__init__(trace, theory, watch)
+        self._log = log
+        self._speedups = speedups
+        self.clique: list[int] = []
+
+    def next_size(self, failed: int) -> int:
+        steps = len(self._trace)
+        if self.size < FIRST_PREFIXES:
+            return min(steps, max(failed + 1, FIRST_PREFIXES))
+        return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * self.size, AT_ONCE))
+
+    def grow(self, size: int) -> None:
+        if size == self.size:
+            return
+        began = time.perf_counter()
+        self.size = size
+        seen = self._log.seen[:size]
+        apart = apartness(seen, self._log.actions[: size - 1])
+        self._watch.check()
+        self.clique = clique(apart, seen) if self._speedups.clique else [0]
+        pinned = {step: name for name, step in enumerate(self.clique)}
+        compatible = ~apart[:, self.clique]
+        same_view = np.asarray(seen)[:, None] == np.asarray(seen)[self.clique][None, :]
+        self._may_be = [[pinned[t]] if t in pinned else row.nonzero()[0].tolist() for t, row in enumerate(compatible & same_view)]
+        self._spares = dict.fromkeys(seen, 1)
+        self._links = dict.fromkeys(range(size - 1))
+        if self._speedups.lazy:
+            self._links = dict.fromkeys(t for t in [0, *self.clique] if t < size - 1)
+        self.bound = max(self.bound or 0, len(self.clique))
+        self.ground_seconds += time.perf_counter() - began
+        self._restart()
+
+    def improving_maps(self) -> Iterator[Found]:
+        if self.size == 1:
+            yield self._found((0,))
+            return
+        while True:
+            lazy = len(self._links) < self.size - 1
+            answer = None
+            answers = self._answers(facts.read_names, "opt", 0, conflicts=PATIENCE if lazy else -1, on_bound=self._raise_bound)
+            while True:
+                try:
+                    answer = next(answers)
+                except StopIteration as end:
+                    proven = end.value
+                    break
+            if not proven or answer is None:
+                self._add(range(self.size - 1))
+            elif not self._widened(answer):
+                self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
+                labels, failed = self._follow(answer)
+                if not failed:
+                    yield self._found(labels)
+                    return
+                self._add(failed)
+
+    def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
+        if self.size == 1:
+            yield self._found((0,))
+            return
+        spares = cost[0] - len(self.clique)
+        beyond = [(facts.BEYOND, True)]
+        while True:  # until no map of this cost needs a rest
+            answer = next(self._answers(facts.read_names, f"enum,{spares},{spares}", 1, assumptions=beyond), None)
+            if answer is None or not self._widened(answer):
+                break
+        while True:
+            held: list[Found] = []
+            failed: Iterable[int] = ()
+            lazy = len(self._links) < self.size - 1
+            for answer in self._answers(facts.read_names, f"enum,{spares},0", 0):
+                labels, failed = self._follow(answer)
+                if failed:
+                    break
+                held.append(self._found(labels))
+                if not lazy:
+                    yield held.pop()
+                elif len(held) == (enough or HELD_BACK):
+                    failed = () if enough else range(self.size - 1)
+                    break
+            if not failed:
+                yield from held
+                return
+            self._add(failed)
+
+    def _raise_bound(self, costs: Sequence[int]) -> None:
+        self.bound = max(self.bound or 0, len(self.clique) + costs[0])
+
+    def _found(self, labels: Sequence[int]) -> Found:
+        found = facts.causal_map(labels, self._trace)
+        return Found(found, (len(found.dstates),))
+
+    def _restart(self) -> None:
+        """Take a new control, for other names."""
+        began = time.perf_counter()
+        names = [(name, self._log.seen[step]) for name, step in enumerate(self.clique)]
+        spares: dict[int, list[int]] = {}
+        for view, count in self._spares.items():
+            spares[view] = list(range(len(names), len(names) + count + 1))
+            names += [(name, view) for name in spares[view]]
+        self._rest = {found[-1]: view for view, found in spares.items()}
+        self._choices = [
+            options if len(options) == 1 and t == self.clique[options[0]] else options + spares[self._log.seen[t]]
+            for t, options in enumerate(self._may_be)
+        ]
+        leads = {
+            (s, action, x)
+            for t, action in enumerate(self._log.actions[: self.size - 1])
+            for s in self._choices[t]
+            if s not in self._rest
+            for x in self._choices[t + 1]
+        }
+        self._control = clingo.Control(["--warn=none", *(["--opt-strategy=usc"] if self._speedups.core_guided else [])])
+        self._control.load(encodings.path("names"))
+        self._control.add("base", [], facts.name_facts(names, spares.values(), leads))
+        self._control.ground([("base", [])])
+        self._given: set[int] = set()  # steps
+        self._last: dict[int, int] = {}  # by view, the step given last
+        self._batches = 0
+        self.ground_seconds += time.perf_counter() - began
+        links, self._links = self._links, {}
+        self._add(links)
+
+    def _add(self, links: Iterable[int]) -> None:
+        """Give clingo these links, and the steps at their ends."""
+        self._watch.check()
+        began = time.perf_counter()
+        added = [t for t in links if t not in self._links]
+        given = []
+        for t in (t for link in added for t in (link, link + 1)):
+            if t not in self._given:
+                self._given.add(t)
+                view = self._log.seen[t]
+                given.append((t, view, self._choices[t], self._last.get(view)))
+                if len(self._choices[t]) > 1:
+                    self._last[view] = t
+        self._links.update(dict.fromkeys(added))
+        part, batch = f"batch_{self._batches}", self._batches
+        self._control.add(part, [], facts.batch_facts(batch, given, [(t, self._log.actions[t]) for t in added]))
+        self._control.ground([(part, [])])
+        self._control.ground([("more", facts.step_number(batch))])
+        self._batches += 1
+        self.ground_seconds += time.perf_counter() - began
+
+    def _widened(self, answer: dict[int, int]) -> bool:
+        """Take more spare names for the views of which the answer uses the rest. Says whether there were any."""
+        used = {self._rest[name] for name in answer.values() if name in self._rest}
+        for view in used:
+            self._spares[view] += 1
+        if used:
+            self._restart()
+        return bool(used)
+
+    def _follow(self, answer: dict[int, int]) -> tuple[list[int], list[int]]:
+        """The name of every step, following the answer's links from step to step, and the links that it does not explain."""
+        actions = self._log.actions
+        goes: dict[tuple[int, int], int | None] = {(answer[t], actions[t]): answer[t + 1] for t in self._links}
+        labels = [answer[0]]
+        failed: list[int] = []
+        followed: list[int] = []  # links since the last step that clingo labelled
+        here: int | None = answer[0]
+        for t in range(self.size - 1):
+            there = None
+            if here is not None:
+                followed.append(t)
+                key = (here, actions[t])
+                if key not in goes:
+                    failed.append(t)
+                    goes[key] = None  # ask for one such link, not for all
+                there = goes[key]
+                if there is not None and (there not in self._choices[t + 1] or answer.get(t + 1, there) != there):
+                    failed += [link for link in followed if link not in self._links]
+                    there = None
+            if there is None or t + 1 in answer:
+                followed = []
+                there = answer.get(t + 1)
+            here = there
+            labels.append(-1 if here is None else here)
+        return labels, failed

@@ -1,0 +1,40 @@
+"""What makes solving fast, each to be switched off alone: for tests, and to see what it gains (docs/performance.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+
+from ssh_abduction.errors import SolverError, brief
+
+
+@dataclass(frozen=True, slots=True)
+class Speedups:
+    """Which speed-ups are on. None changes the answer.
+
+    prefixes     solve for a prefix, replay its maps, and extend it where they fail
+    path_names   begin with few names for paths
+    names        causal theory: give the dstates names beforehand
+    clique       with names: pin steps that are pairwise apart
+    lazy         with names: give clingo only the links that replaying contradicts
+    core_guided  with names: raise the bound from below, rather than better the map
+    greedy       causal theory: a map by merging greedily, at once, which a time limit cannot miss
+    """
+
+    prefixes: bool = True
+    path_names: bool = True
+    names: bool = True
+    clique: bool = True
+    lazy: bool = True
+    core_guided: bool = True
+    greedy: bool = True
+
+    @classmethod
+    def without(cls, names: str | Iterable[str]) -> Speedups:
+        """All but these. Raises SolverError."""
+        off = [name for name in (names.split(",") if isinstance(names, str) else names) if name]
+        known = [f.name for f in fields(cls)]
+        for name in off:
+            if name not in known:
+                raise SolverError(f"speedups: expected names out of {', '.join(known)}, got {brief(name)}")
+        return cls(**dict.fromkeys(off, False))

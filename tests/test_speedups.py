@@ -1,0 +1,114 @@
+"""No speed-up changes an answer: each switched off alone, all of them, and none, against each other and the un-accelerated encoding."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from unittest.mock import patch
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import traces
+
+from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, named, solve
+from ssh_abduction.apart import apartness, clique
+from ssh_abduction.checker import check
+from ssh_abduction.replay import Log
+
+NAMES = [f.name for f in fields(Speedups)]
+PLAIN = Speedups.without(NAMES)
+
+
+@st.composite
+def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
+    """A walk in a random machine of few states, or any trace at all: maps that close, and maps that do not."""
+    if draw(st.booleans()):
+        return draw(traces(max_steps=8))
+    states = draw(st.integers(1, 6))
+    views = draw(st.lists(st.sampled_from("ab"), min_size=states, max_size=states))
+    follow = draw(st.lists(st.lists(st.integers(0, states - 1), min_size=2, max_size=2), min_size=states, max_size=states))
+    done = draw(st.lists(st.integers(0, 1), min_size=1, max_size=most_steps))
+    state, seen = 0, [views[0]]
+    for action in done:
+        state = follow[state][action]
+        seen.append(views[state])
+    return Trace.from_steps(seen, [("travel", "right")[action] for action in done])
+
+
+@settings(max_examples=400, deadline=None, derandomize=True)
+@given(machines(), st.sets(st.sampled_from(NAMES)), st.data())
+def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trace, off: set[str], data: st.DataObject) -> None:
+    """With prefixes, patience and what is held back so small that all of it happens on short traces."""
+    expected = solve(trace, Theory.causal(), maps=0, speedups=PLAIN)
+    first = data.draw(st.sampled_from([2, 5, 32]), label="first prefixes")
+    at_once = data.draw(st.sampled_from([4, 8000]), label="at once")
+    patience = data.draw(st.sampled_from([0, 1, 2000]), label="patience")
+    held = data.draw(st.sampled_from([1, 100]), label="held back")
+    with patch.multiple(named, FIRST_PREFIXES=first, AT_ONCE=at_once, PATIENCE=patience, HELD_BACK=held):
+        found = solve(trace, Theory.causal(), maps=0, speedups=Speedups.without(off))
+    assert found.status is expected.status is Status.OPTIMAL
+    assert found.cost == expected.cost
+    assert set(found.maps) == set(expected.maps)
+    assert found.count == len(set(found.maps))
+    assert found.complete
+
+
+@pytest.mark.parametrize("off", NAMES)
+@pytest.mark.parametrize(
+    "theory", [Theory.causal(), Theory.topological(), Theory.circumscriptive()], ids=["causal", "topological", "circumscriptive"]
+)
+def test_each_speedup_off_alone(off: str, theory: Theory) -> None:
+    trace = Trace.from_steps([f"v{i % 4}" for i in range(24)], [("right", "travel")[i % 2] for i in range(23)])
+    found, expected = solve(trace, theory, maps=0, speedups=Speedups.without(off)), solve(trace, theory, maps=0)
+    assert set(found.maps) == set(expected.maps)
+    assert found.cost == expected.cost
+
+
+@pytest.mark.parametrize("most", [1, 2, 5])
+def test_as_many_maps_as_asked_for(most: int) -> None:
+    """Spurs off a ring that look alike: with what is lazy, and what is held back, the number asked for comes, and no map twice."""
+    trace = Trace.from_steps("abacabadabacab", ["travel", "right", "travel", "left", "right", "right", "travel"] + ["travel", "left"] * 3)
+    every = solve(trace, Theory.causal(), maps=0, speedups=PLAIN)
+    found = solve(trace, Theory.causal(), maps=most)
+    assert found.count == min(most, every.count)
+    assert set(found.maps) <= set(every.maps)
+    assert found.complete == (every.count <= most)
+
+
+@given(machines(most_steps=40))
+def test_merging_greedily_gives_a_map(trace: Trace) -> None:
+    theory = Theory.causal()
+    with patch.object(named.NamedEngine, "grow", side_effect=KeyboardInterrupt):
+        found = solve(trace, theory)
+    assert found.status is Status.FEASIBLE
+    assert check(trace, found.maps[0], theory) == ()
+
+
+@given(machines(most_steps=30))
+def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
+    """The matrix against its definition, step by step; and every step of the clique is apart from every other."""
+    log = Log(trace, Theory.causal())
+    apart = apartness(log.seen, log.actions)
+    for i in range(len(trace)):
+        for j in range(len(trace)):
+            k = 0
+            while log.seen[i + k] == log.seen[j + k] and log.actions[i + k : i + k + 1] == log.actions[j + k : j + k + 1] != []:
+                k += 1
+            assert apart[i, j] == (log.seen[i + k] != log.seen[j + k])
+    steps = clique(apart, log.seen)
+    assert steps == sorted(set(steps))
+    assert all(apart[i, j] for i in steps for j in steps if i != j)
+
+
+def test_a_search_without_greedy_merging_has_a_bound_when_time_is_over() -> None:
+    """The clique is a bound before clingo has said anything."""
+    trace = Trace.from_steps("abcabd", ["travel"] * 5)
+    search = Search(trace, Theory.causal(), speedups=Speedups.without("greedy"))
+    with patch.object(named.NamedEngine, "improving_maps", side_effect=KeyboardInterrupt):
+        assert list(search) == []
+    assert search.bound.dstates == 4 + 2  # a, b, c, d, and the first a and b, which lead to another c and d
+
+
+def test_unknown_speedups_are_an_error() -> None:
+    with pytest.raises(SolverError, match=r"speedups: expected names out of prefixes, .*, got 'magic'"):
+        Speedups.without("magic")
