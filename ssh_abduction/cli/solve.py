@@ -1,4 +1,4 @@
-"""ssh-abduction solve TRACE: the minimal maps of a trace."""
+"""ssh-abduction solve TRACE: the minimal maps of a trace. Many traces go to batch.py."""
 
 from __future__ import annotations
 
@@ -24,18 +24,33 @@ SHOWN = 4  # maps compared on the terminal; --json has all
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = verbs.add_parser("solve", help="find the minimal maps of a trace", description="Find the minimal maps of a trace.")
-    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
+    text = "Find the minimal maps of a trace, or of many: then the result of each is one line."
+    parser = verbs.add_parser("solve", help="find the minimal maps of a trace, or of many", description=text)
+    parser.add_argument("traces", nargs="+", metavar="trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument("-n", "--maps", type=int, default=100, metavar="K", help="stop after K maps; 0 for all (default: 100)")
-    parser.add_argument("--json", action="store_true", help="print the solution as JSON, map by map as they are found")
+    parser.add_argument(
+        "--json", action="store_true", help="print the solution as JSON, map by map as they are found; of many traces, a line each"
+    )
     parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds with the best answer so far")
     parser.add_argument("--memory-limit", type=int, metavar="MIB", help="stop when the process has used so much memory")
+    many = parser.add_argument_group(
+        "many traces",
+        "With several traces, or --jobs, each result is a line, in the order of the traces. What goes wrong with a trace is on its line, "
+        "and the others go on. The exit code is 1 if anything went wrong, else the highest of the traces' codes. Limits are for each trace, but "
+        "memory is that of the process: except on Linux, what traces before used counts too.",
+    )
+    jobs = "solve N traces at a time, each in a process; -1 for one a core (default: 1)"
+    many.add_argument("--jobs", type=int, metavar="N", help=jobs)
     add_theory(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    trace = Trace.load(options.trace)
+    if len(options.traces) > 1 or options.jobs is not None:
+        from ssh_abduction.cli import batch
+
+        return batch.run(options)
+    trace = Trace.load(options.traces[0])
     with _progress(trace) as on_progress:
         search = Search(
             trace,
