@@ -1,4 +1,4 @@
-"""Many traces at once: order, errors, killed processes, Ctrl-C; the same results here and in other processes."""
+"""Many traces at once: order, errors, killed processes, Ctrl-C; the same results here, in processes and on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -15,7 +16,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import dask
 import pytest
+from distributed import LocalCluster
 from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Theory, Trace
@@ -51,6 +54,16 @@ def traces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "broken.jsonl").write_text('{"format": "ssh-trace", "version": 1}\n{"view": }\n')
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """The address of a Dask scheduler with one worker of one thread, in a process of its own."""
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
+    ):
+        yield cluster.scheduler_address
 
 
 def without_seconds(text: str) -> str:
@@ -97,10 +110,10 @@ def test_json_lines_are_the_single_objects(traces: Path, capsys: pytest.CaptureF
     assert main(["check", "quick.jsonl", "maps.json"]) == 0  # a line is what the other verbs read
 
 
-def test_everywhere_the_same(traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_everywhere_the_same(traces: Path, scheduler: str, capsys: pytest.CaptureFixture[str]) -> None:
     paths = [f"{name}.jsonl" for name in ("comb", "quick", "broken", "impossible", "quick")]
     shown = {}
-    for where in ((), ("--jobs", "2")):
+    for where in ((), ("--jobs", "2"), ("--scheduler", scheduler), ("--scheduler", scheduler, "--jobs", "1")):
         assert main(["solve", *paths, "--json", *where]) == 1
         shown[where] = without_seconds(capsys.readouterr().out)
     assert shown[()].count("\n") == len(paths)
@@ -117,18 +130,37 @@ def test_the_worst_exit_code(paths: str, code: int, traces: Path, capsys: pytest
     assert (capsys.readouterr().err == "") == (code != 1)
 
 
-def test_wrong_choices_are_one_line(traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_choices_are_one_line(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(batch, "PATIENCE", 0.5)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        nobody = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     both = ["quick.jsonl", "comb.jsonl"]
     for words, message in (
         ([*both, "--jobs", "0"], r"--jobs: expected .* got 0; leave it out for 1"),
         (["quick.jsonl", "-"], r"-: expected files .* got standard input; save it to a file"),
         (["-", "--jobs", "2"], r"-: expected files .* got standard input; save it to a file"),
         ([*both, "--theory", "causal", "--boundary", "strict"], r"boundary: expected none with level=causal.*"),
+        ([*both, "--scheduler", nobody], rf"--scheduler: expected a Dask scheduler at {nobody}, got none \(.*\); start one with: .*"),
+        ([*both, "--scheduler", "elsewhere"], r"--scheduler: expected a Dask scheduler at elsewhere, got none \(missing port.*"),
     ):
         assert main(["solve", *words]) == 1
         out, err = capsys.readouterr()
         assert out == ""
         assert re.fullmatch(rf"ssh-abduction: {message}\n", err)
+
+
+def test_a_scheduler_without_workers(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(batch, "PATIENCE", 0.5)
+    with LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster:
+        assert main(["solve", "quick.jsonl", "--scheduler", cluster.scheduler_address]) == 1
+    assert re.fullmatch(r"ssh-abduction: --scheduler: expected a worker, got none in 0.5 s; start one with: .*\n", capsys.readouterr().err)
+
+
+def test_without_the_extra(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert main(["solve", "quick.jsonl", "--scheduler", "tcp://127.0.0.1:1"]) == 1
+    assert capsys.readouterr().err.endswith("; pip install 'ssh-abduction[cluster]'\n")
 
 
 def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,13 +171,26 @@ def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -
     assert QUESTION.answer(3, "a\nb.jsonl") == Answer(3, r"'a\nb.jsonl': error: MemoryError: no room for so many steps", 1)
 
 
-def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path) -> None:
+def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler: str) -> None:
     deadly = Deadly(*(getattr(QUESTION, name) for name in Question.__slots__))
     paths = [f"{name}.jsonl" for name in ("quick", "deadly", "comb", "quick")]
-    lines = {answer.number: answer.line for answer in batch._here(deadly, paths, 2)}
-    assert sorted(lines) == [*range(len(paths))]
-    for number, path in enumerate(paths):
-        assert lines[number].startswith(f"{path}: {'error: process: expected' if 'deadly' in path else 'optimal'}")
+    for answers in (batch._here(deadly, paths, 2), batch._on_cluster(deadly, paths, scheduler, None)):
+        lines = {answer.number: answer.line for answer in answers}
+        assert sorted(lines) == [*range(len(paths))]
+        for number, path in enumerate(paths):
+            assert lines[number].startswith(f"{path}: {'error: process: expected' if 'deadly' in path else 'optimal'}")
+
+
+def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler: str) -> None:
+    theory = Theory.topological().replace(boundary="none", path_order="partial", prefer=())
+    endless = Question(theory, limit=30, maps=0, memory=None, json=False)
+    answers = batch._on_cluster(endless, ["quick.jsonl", "slow.jsonl"], scheduler, None)
+    assert next(answers).number == 0
+    time.sleep(0.5)  # the only thread of the worker is at the slow one
+    answers.close()
+    began = time.monotonic()
+    assert [answer.code for answer in batch._on_cluster(QUESTION, ["comb.jsonl"], scheduler, None)] == [0]
+    assert time.monotonic() - began < 15
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forgets the peak of memory")

@@ -1,4 +1,4 @@
-"""ssh-abduction solve TRACE TRACE …: many traces, one result a line.
+"""ssh-abduction solve TRACE TRACE …: many traces, here or on a Dask cluster, one result a line.
 
 Results come as they are ready and are printed in the order of the traces. An error is the result of its trace, and the others go on.
 """
@@ -9,15 +9,17 @@ import argparse
 import contextlib
 import ctypes
 import gc
+import logging
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import BrokenExecutor, CancelledError
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from ssh_abduction.cli import EXIT_ERROR, EXIT_INTERRUPTED
 from ssh_abduction.cli.options import theory_of
@@ -28,9 +30,14 @@ from ssh_abduction.solver import Search
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
 Task: TypeAlias = tuple[int, str]  # the number of a trace, and its path
 
+PATIENCE = 10  # seconds for a Dask scheduler, and for its first worker, to answer
 KILLED = "process: expected an answer, got killed, as happens when memory runs out; set --memory-limit, or solve fewer traces at a time"
+LOST = "scheduler: expected an answer, got disconnected; see whether it still runs, and solve this trace again"
 
 
 class Answer(NamedTuple):
@@ -43,7 +50,7 @@ class Answer(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked about each trace: limit, maps and memory as of Search. Plain data, as it travels to other processes."""
+    """What is asked about each trace: limit, maps and memory as of Search. Plain data, as it travels to other processes and machines."""
 
     theory: Theory
     limit: float | None
@@ -51,17 +58,22 @@ class Question:
     memory: int | None
     json: bool
 
-    def answer(self, number: int, path: str) -> Answer:
-        """Solve the trace in a file. Whatever goes wrong is the answer."""
+    def answer(self, number: int, path: str, trace: Trace | None = None, given_up: Callable[[], bool] = lambda: False) -> Answer:
+        """Solve a trace, read from its file if it did not come along. Whatever goes wrong is the answer. Stops when it is given up."""
         try:
-            return self._solved(number, path, Trace.load(path))
+            return self._solved(number, path, trace or Trace.load(path), given_up)
         except Exception as error:  # of any kind, such as no memory left: the other traces must not suffer
             return self.failed(number, path, error)
 
-    def _solved(self, number: int, path: str, trace: Trace) -> Answer:
+    def _solved(self, number: int, path: str, trace: Trace, given_up: Callable[[], bool]) -> Answer:
         if self.memory is not None:
             _forget_memory()
-        search = Search(trace, self.theory, limit=self.limit, maps=self.maps, memory=self.memory)
+
+        def on_progress(_: object) -> None:
+            if given_up():
+                search.interrupt()
+
+        search = Search(trace, self.theory, limit=self.limit, maps=self.maps, memory=self.memory, on_progress=on_progress)
         with on_ctrl_c(search.interrupt):
             maps = [ssh_map.to_dict() for ssh_map in search if self.json]
             explanation = explained(search)
@@ -82,11 +94,14 @@ class Question:
 def run(options: argparse.Namespace) -> int:
     paths: list[str] = options.traces
     if "-" in paths:
-        raise SSHError("-: expected files where there are several traces or --jobs, got standard input; save it to a file")
+        raise SSHError("-: expected files where there are several traces, --jobs or --scheduler, got standard input; save it to a file")
     if options.jobs == 0:
         raise SSHError("--jobs: expected how many traces to solve at a time, or -1 for one a core, got 0; leave it out for 1")
     question = Question(theory_of(options), options.time_limit, options.maps, options.memory_limit, options.json)
-    answers = _here(question, paths, options.jobs or 1)
+    if options.scheduler is None:
+        answers = _here(question, paths, options.jobs or 1)
+    else:
+        answers = _on_cluster(question, paths, options.scheduler, options.jobs)
     lines: dict[int, str] = {}  # of answers whose turn has not come
     codes: list[int] = []
     turn = 0
@@ -131,6 +146,27 @@ def _here(question: Question, paths: Sequence[str], jobs: int) -> Generator[Answ
             get_reusable_executor().shutdown()  # else joblib keeps them, in this folder, for whoever calls next
 
 
+def _on_cluster(question: Question, paths: Sequence[str], address: str, jobs: int | None) -> Generator[Answer]:
+    """Answers from the workers of a Dask scheduler."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise SSHError("--scheduler: expected the package distributed, got none; pip install 'ssh-abduction[cluster]'") from None
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what goes wrong is in the answers
+    warnings.filterwarnings("ignore", "Sending large graph")  # a long trace goes to one worker, once
+    try:
+        client = Client(address, timeout=PATIENCE, set_as_default=False)
+    except Exception as error:  # whatever else listens there may answer anything
+        raise SSHError(f"--scheduler: expected a Dask scheduler at {address}, got none ({error}); start one with: dask scheduler") from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError:
+            raise SSHError(f"--scheduler: expected a worker, got none in {PATIENCE} s; start one with: dask worker {address}") from None
+        most = jobs if jobs is not None and jobs > 0 else 2 * sum(client.ncores().values())
+        yield from _answers(question, paths, partial(_on_workers, question, client, most))
+
+
 def _answers(question: Question, paths: Sequence[str], attempt: Callable[[list[Task], list[Task]], Iterator[Answer]]) -> Iterator[Answer]:
     """Answers as they are ready, in any order.
 
@@ -167,6 +203,54 @@ def _noted(tasks: Iterable[Task], begun: list[int]) -> Iterator[Task]:
     for task in tasks:
         begun.append(task[0])
         yield task
+
+
+def _on_workers(question: Question, client: Client, most: int, tasks: list[Task], killed: list[Task]) -> Iterator[Answer]:
+    """An attempt on Dask, with so many traces at most sent at a time. They are read here: workers need not share the disk.
+
+    This is Dask's own interface, as joblib's backend for Dask waits for ever when a worker is killed.
+    """
+    from distributed import KilledWorker, as_completed
+
+    sent: dict[Future[Answer], Task] = {}
+    ready = as_completed(loop=client.loop)
+
+    def received(futures: Iterable[Future[Answer]]) -> Iterator[Answer]:
+        for future in futures:
+            task = sent.pop(future)
+            try:
+                yield future.result()
+            except KilledWorker:
+                killed.append(task)
+            except CancelledError:
+                yield question.failed(*task, SolverError(LOST))
+            except Exception as error:  # of the cluster, as `answer` catches those of the trace
+                mend = "install the same ssh-abduction where the scheduler and its workers run"
+                yield question.failed(*task, SolverError(f"cluster: expected an answer, got {type(error).__name__}: {error}; {mend}"))
+
+    for number, path in tasks:
+        try:
+            if client.status != "running":
+                raise SolverError(LOST)
+            future = client.submit(_on_worker, question, number, path, Trace.load(path), pure=False)
+        except Exception as error:
+            yield question.failed(number, path, error)
+            continue
+        sent[future] = number, path
+        ready.add(future)
+        yield from received(islice(ready, max(0, len(sent) + 1 - most)))
+    yield from received(ready)
+    for task in sent.values():  # Dask says nothing about these once the scheduler is gone
+        yield question.failed(*task, SolverError(LOST))
+
+
+def _on_worker(question: Question, number: int, path: str, trace: Trace) -> Answer:
+    """The answer, on a Dask worker. A worker runs on when its client has gone, so the search looks now and then whether it has."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    task = worker.state.tasks[worker.get_current_task()]
+    return question.answer(number, path, trace, lambda: task.state == "cancelled")
 
 
 def _forget_memory() -> None:

@@ -35,18 +35,19 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("--memory-limit", type=int, metavar="MIB", help="stop when the process has used so much memory")
     many = parser.add_argument_group(
         "many traces",
-        "With several traces, or --jobs, each result is a line, in the order of the traces. What goes wrong with a trace is on its line, "
+        "With several traces, or one of these, each result is a line, in the order of the traces. What goes wrong with a trace is on its line, "
         "and the others go on. The exit code is 1 if anything went wrong, else the highest of the traces' codes. Limits are for each trace, but "
-        "memory is that of the process: except on Linux, what traces before used counts too.",
+        "memory is that of the process: what other threads of a Dask worker use counts too, and, except on Linux, what traces before used.",
     )
-    jobs = "solve N traces at a time, each in a process; -1 for one a core (default: 1)"
+    jobs = "solve N traces at a time, each in a process; -1 for one a core (default: 1; with --scheduler, as many as its workers can)"
     many.add_argument("--jobs", type=int, metavar="N", help=jobs)
+    many.add_argument("--scheduler", metavar="ADDRESS", help="solve on the workers of the Dask scheduler at this address, tcp://host:port")
     add_theory(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    if len(options.traces) > 1 or options.jobs is not None:
+    if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
         from ssh_abduction.cli import batch
 
         return batch.run(options)
