@@ -6,6 +6,8 @@ import contextlib
 import io
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,14 @@ def test_the_shell_lines_print_what_is_shown(tmp_path: Path, monkeypatch: pytest
         shown.append(out.getvalue())
     assert without_seconds(shown[0]) == without_seconds(BLOCKS[index + 1][1])
     assert shown[2].strip() in README
+
+
+def test_the_line_of_many_traces_prints_what_is_shown() -> None:
+    index, line = next((i, text) for i, (_, text) in enumerate(BLOCKS) if text.startswith("ssh-abduction solve examples/*"))
+    command = line.replace("ssh-abduction", f"{shlex.quote(sys.executable)} -m ssh_abduction", 1)
+    done = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert without_seconds(done.stdout) == without_seconds(BLOCKS[index + 1][1])
 
 
 def test_the_picture_is_the_map() -> None:

@@ -1,4 +1,4 @@
-"""ssh-abduction solve TRACE: the minimal maps of a trace."""
+"""ssh-abduction solve TRACE: the minimal maps of a trace. Many traces go to batch.py."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import json
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import Any
 
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
-from ssh_abduction.cli.text import describe, differences
+from ssh_abduction.cli.text import describe, differences, headline
 from ssh_abduction.explain import Explanation, Interrupted, explain
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import Progress, Search, Solution, Status
@@ -24,18 +24,34 @@ SHOWN = 4  # maps compared on the terminal; --json has all
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = verbs.add_parser("solve", help="find the minimal maps of a trace", description="Find the minimal maps of a trace.")
-    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
+    text = "Find the minimal maps of a trace, or of many: then the result of each is one line."
+    parser = verbs.add_parser("solve", help="find the minimal maps of a trace, or of many", description=text)
+    parser.add_argument("traces", nargs="+", metavar="trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument("-n", "--maps", type=int, default=100, metavar="K", help="stop after K maps; 0 for all (default: 100)")
-    parser.add_argument("--json", action="store_true", help="print the solution as JSON, map by map as they are found")
+    parser.add_argument(
+        "--json", action="store_true", help="print the solution as JSON, map by map as they are found; of many traces, a line each"
+    )
     parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds with the best answer so far")
     parser.add_argument("--memory-limit", type=int, metavar="MIB", help="stop when the process has used so much memory")
+    many = parser.add_argument_group(
+        "many traces",
+        "With several traces, or one of these, each result is a line, in the order of the traces. What goes wrong with a trace is on its line, "
+        "and the others go on. The exit code is 1 if anything went wrong, else the highest of the traces' codes. Limits are for each trace, but "
+        "memory is that of the process: what other threads of a Dask worker use counts too, and, except on Linux, what traces before used.",
+    )
+    jobs = "solve N traces at a time, each in a process; -1 for one a core (default: 1; with --scheduler, as many as its workers can)"
+    many.add_argument("--jobs", type=int, metavar="N", help=jobs)
+    many.add_argument("--scheduler", metavar="ADDRESS", help="solve on the workers of the Dask scheduler at this address, tcp://host:port")
     add_theory(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    trace = Trace.load(options.trace)
+    if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
+        from ssh_abduction.cli import batch
+
+        return batch.run(options)
+    trace = Trace.load(options.traces[0])
     with _progress(trace) as on_progress:
         search = Search(
             trace,
@@ -45,18 +61,23 @@ def run(options: argparse.Namespace) -> int:
             memory=options.memory_limit,
             on_progress=on_progress,
         )
-        with _interrupts(search):
+        with on_ctrl_c(search.interrupt):
             kept = _print_json(search) if options.json else list(_first(search, SHOWN))
-            explanation = _explained(search)
+            explanation = explained(search)
         solution = search.solution(tuple(kept))
     if options.json:
         _print_end(search, solution, explanation)
     else:
         _print_text(search, solution, explanation)
-    return 130 if search.stopped == "interrupted" else EXIT_CODES[solution.status]
+    return exit_code(solution)
 
 
-def _explained(search: Search) -> Explanation | None:
+def exit_code(solution: Solution) -> int:
+    """What the shell is told of a solution."""
+    return 130 if solution.stopped == "interrupted" else EXIT_CODES[solution.status]
+
+
+def explained(search: Search) -> Explanation | None:
     """Why there is no map, if that is so and there is time to find out."""
     if search.status is not Status.UNSATISFIABLE:
         return None
@@ -76,19 +97,28 @@ def _first(search: Search, most: int) -> Iterator[SSHMap]:
 
 def _print_json(search: Search) -> list[SSHMap]:
     """The maps, one a line, as they come; none is kept."""
-    head = {"theory": search.theory.to_dict(), "steps": len(search.trace)}
-    sys.stdout.write(_dump(head)[:-1] + ', "maps": [')
+    sys.stdout.write(dump(opening(search))[:-1] + ', "maps": [')
     for i, ssh_map in enumerate(search):
-        sys.stdout.write(("," if i else "") + "\n" + _dump(ssh_map.to_dict()))
+        sys.stdout.write(("," if i else "") + "\n" + dump(ssh_map.to_dict()))
     sys.stdout.write("\n]")
     return []
 
 
 def _print_end(search: Search, solution: Solution, explanation: Explanation | None) -> None:
+    print("," + dump(ending(solution, search.count, explanation))[1:])
+
+
+def opening(search: Search) -> dict[str, Any]:
+    """What the JSON of a solution says before its maps."""
+    return {"theory": search.theory.to_dict(), "steps": len(search.trace)}
+
+
+def ending(solution: Solution, count: int, explanation: Explanation | None) -> dict[str, Any]:
+    """What the JSON of a solution says after its maps, which were `count`."""
     end: dict[str, Any] = {
         "status": solution.status.value,
         "complete": solution.complete,
-        "count": search.count,
+        "count": count,
         "cost": solution.cost.to_dict() if solution.cost else None,
         "bound": solution.bound.to_dict(),
         "prefix": solution.prefix,
@@ -100,34 +130,22 @@ def _print_end(search: Search, solution: Solution, explanation: Explanation | No
         end["partial"] = solution.partial.to_dict()
     if explanation:
         end["explanation"] = explanation.to_dict()
-    print("," + _dump(end)[1:])
+    return end
 
 
-def _dump(value: dict[str, Any]) -> str:
+def dump(value: dict[str, Any]) -> str:
+    """JSON on one line."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
 
 def _print_text(search: Search, solution: Solution, explanation: Explanation | None) -> None:
-    if explanation:
-        print(f"{solution.status.value}: {explanation}")
-        return
+    print(headline(solution, search.count, explanation))
     if solution.status is Status.UNSATISFIABLE:
-        print(f"unsatisfiable: no map satisfies the axioms; why was not found out in time ({solution.stopped})")
         return
-    why = f" ({solution.stopped})" if solution.stopped else ""
-    seconds = f"{solution.seconds.total:.2f} s, {solution.prefix} of {solution.steps} steps given to clingo"
-    bound = ", ".join(f"at least {v} {k}" for k, v in solution.bound.to_dict().items())
     if solution.cost is None:
-        print(f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; any has {bound or 'no proven bound'}; {seconds}")
         if solution.partial:
             print(f"\nbest map of the first {len(solution.partial.labels)} steps\n{describe(solution.partial)}")
         return
-    counts = ", ".join(f"{v} {k}" for k, v in solution.cost.to_dict().items())
-    if solution.status is Status.FEASIBLE:
-        print(f"feasible{why}: {counts}, not proven minimal; any map has {bound or 'no proven bound'}; {seconds}")
-    else:
-        maps = "1 minimal map" if search.count == 1 else f"{search.count} minimal maps"
-        print(f"optimal: {counts}; {maps}{'' if solution.complete else f', and there may be more{why}'}; {seconds}")
     print(f"\n{'map 1' if search.count > 1 else 'map'}\n{describe(solution.maps[0])}")
     if len(solution.maps) > 1:
         some = "" if search.count <= SHOWN else f" (the first {SHOWN}; --json lists all)"
@@ -135,12 +153,12 @@ def _print_text(search: Search, solution: Solution, explanation: Explanation | N
 
 
 @contextlib.contextmanager
-def _interrupts(search: Search) -> Iterator[None]:
-    """Ctrl-C ends the search, and what it found is still printed."""
+def on_ctrl_c(action: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C does this, rather than stop the program wherever it is: what was found is still printed."""
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may handle signals
         return
-    before = signal.signal(signal.SIGINT, lambda *_: search.interrupt())
+    before = signal.signal(signal.SIGINT, lambda *_: action())
     try:
         yield
     finally:

@@ -4,8 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ssh_abduction.explain import Explanation
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver import Solution, Status
 from ssh_abduction.trace import Trace
+
+
+def headline(solution: Solution, count: int, explanation: Explanation | None) -> str:
+    """How a search ended, on one line. `count` is how many maps it found, of which the solution need not hold any."""
+    if explanation:
+        return f"{solution.status.value}: {explanation}"
+    if solution.status is Status.UNSATISFIABLE:
+        return f"unsatisfiable: no map satisfies the axioms; why was not found out in time ({solution.stopped})"
+    why = f" ({solution.stopped})" if solution.stopped else ""
+    seconds = f"{solution.seconds.total:.2f} s, {solution.prefix} of {solution.steps} steps given to clingo"
+    bound = ", ".join(f"at least {v} {k}" for k, v in solution.bound.to_dict().items())
+    if solution.cost is None:
+        return f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; any has {bound or 'no proven bound'}; {seconds}"
+    counts = ", ".join(f"{v} {k}" for k, v in solution.cost.to_dict().items())
+    if solution.status is Status.FEASIBLE:
+        return f"feasible{why}: {counts}, not proven minimal; any map has {bound or 'no proven bound'}; {seconds}"
+    maps = "1 minimal map" if count == 1 else f"{count} minimal maps"
+    return f"optimal: {counts}; {maps}{'' if solution.complete else f', and there may be more{why}'}; {seconds}"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

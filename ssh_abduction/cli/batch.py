@@ -1,0 +1,281 @@
+"""ssh-abduction solve TRACE TRACE …: many traces, here or on a Dask cluster, one result a line.
+
+Results come as they are ready and are printed in the order of the traces. An error is the result of its trace, and the others go on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import ctypes
+import gc
+import logging
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+from ssh_abduction.cli import EXIT_ERROR, EXIT_INTERRUPTED
+from ssh_abduction.cli.options import theory_of
+from ssh_abduction.cli.solve import dump, ending, exit_code, explained, on_ctrl_c, opening
+from ssh_abduction.cli.text import headline
+from ssh_abduction.errors import SolverError, SSHError, named
+from ssh_abduction.solver import Search
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Trace
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+Task: TypeAlias = tuple[int, str]  # the number of a trace, and its path
+
+PATIENCE = 10  # seconds for a Dask scheduler, and for its first worker, to answer
+KILLED = "process: expected an answer, got killed, as happens when memory runs out; set --memory-limit, or solve fewer traces at a time"
+LOST = "scheduler: expected an answer, got disconnected; see whether it still runs, and solve this trace again"
+
+
+class Answer(NamedTuple):
+    """The result of one trace: the number of the trace, the line to print, and the exit code."""
+
+    number: int
+    line: str
+    code: int
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What is asked about each trace: limit, maps and memory as of Search. Plain data, as it travels to other processes and machines."""
+
+    theory: Theory
+    limit: float | None
+    maps: int
+    memory: int | None
+    json: bool
+
+    def answer(self, number: int, path: str, trace: Trace | None = None, given_up: Callable[[], bool] = lambda: False) -> Answer:
+        """Solve a trace, read from its file if it did not come along. Whatever goes wrong is the answer. Stops when it is given up."""
+        try:
+            return self._solved(number, path, trace or Trace.load(path), given_up)
+        except Exception as error:  # of any kind, such as no memory left: the other traces must not suffer
+            return self.failed(number, path, error)
+
+    def _solved(self, number: int, path: str, trace: Trace, given_up: Callable[[], bool]) -> Answer:
+        if self.memory is not None:
+            _forget_memory()
+
+        def on_progress(_: object) -> None:
+            if given_up():
+                search.interrupt()
+
+        search = Search(trace, self.theory, limit=self.limit, maps=self.maps, memory=self.memory, on_progress=on_progress)
+        with on_ctrl_c(search.interrupt):
+            maps = [ssh_map.to_dict() for ssh_map in search if self.json]
+            explanation = explained(search)
+        solution = search.solution()
+        if self.json:
+            line = dump({"trace": path, **opening(search), "maps": maps, **ending(solution, search.count, explanation)})
+        else:
+            line = f"{named(path)}: {headline(solution, search.count, explanation)}"
+        return Answer(number, line, exit_code(solution))
+
+    def failed(self, number: int, path: str, error: Exception) -> Answer:
+        """The answer for a trace that was not solved."""
+        message = " ".join((str(error) if isinstance(error, SSHError) else f"{type(error).__name__}: {error}").split())
+        line = dump({"trace": path, "status": "error", "error": message}) if self.json else f"{named(path)}: error: {message}"
+        return Answer(number, line, EXIT_ERROR)
+
+
+def run(options: argparse.Namespace) -> int:
+    paths: list[str] = options.traces
+    if "-" in paths:
+        raise SSHError("-: expected files where there are several traces, --jobs or --scheduler, got standard input; save it to a file")
+    if options.jobs == 0:
+        raise SSHError("--jobs: expected how many traces to solve at a time, or -1 for one a core, got 0; leave it out for 1")
+    question = Question(theory_of(options), options.time_limit, options.maps, options.memory_limit, options.json)
+    if options.scheduler is None:
+        answers = _here(question, paths, options.jobs or 1)
+    else:
+        answers = _on_cluster(question, paths, options.scheduler, options.jobs)
+    lines: dict[int, str] = {}  # of answers whose turn has not come
+    codes: list[int] = []
+    turn = 0
+    stop = threading.Event()
+    with _progress(len(paths)) as (say, advance), contextlib.closing(answers):
+        try:
+            for answer in answers:
+                with on_ctrl_c(stop.set):  # so that no line is lost or cut in two
+                    lines[answer.number] = answer.line
+                    codes.append(answer.code)
+                    advance()
+                    while turn in lines:
+                        say(lines.pop(turn))
+                        turn += 1
+                if stop.is_set() or answer.code == EXIT_INTERRUPTED:
+                    raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            stop.set()
+            for number in sorted(lines):
+                say(lines[number])
+    if stop.is_set():
+        missing = len(paths) - sum(code != EXIT_INTERRUPTED for code in codes)
+        print(f"ssh-abduction: interrupted: {missing} of {len(paths)} traces not finished", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    if errors := codes.count(EXIT_ERROR):
+        print(f"ssh-abduction: errors in {errors} of {len(paths)} traces, on their lines", file=sys.stderr)
+        return EXIT_ERROR
+    return max(codes)
+
+
+def _here(question: Question, paths: Sequence[str], jobs: int) -> Generator[Answer]:
+    """Answers from processes of this machine; with one job, from this process."""
+    from joblib import effective_n_jobs
+    from joblib.externals.loky import get_reusable_executor
+
+    warnings.filterwarnings("ignore", module="joblib")  # about processes that ended early: the answers say it better
+    processes = min(effective_n_jobs(jobs), len(paths))
+    try:
+        yield from _answers(question, paths, partial(_in_processes, question, processes))
+    finally:
+        if processes > 1:
+            get_reusable_executor().shutdown()  # else joblib keeps them, in this folder, for whoever calls next
+
+
+def _on_cluster(question: Question, paths: Sequence[str], address: str, jobs: int | None) -> Generator[Answer]:
+    """Answers from the workers of a Dask scheduler."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise SSHError("--scheduler: expected the package distributed, got none; pip install 'ssh-abduction[cluster]'") from None
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what goes wrong is in the answers
+    warnings.filterwarnings("ignore", "Sending large graph")  # a long trace goes to one worker, once
+    try:
+        client = Client(address, timeout=PATIENCE, set_as_default=False)
+    except Exception as error:  # whatever else listens there may answer anything
+        raise SSHError(f"--scheduler: expected a Dask scheduler at {address}, got none ({error}); start one with: dask scheduler") from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError:
+            raise SSHError(f"--scheduler: expected a worker, got none in {PATIENCE} s; start one with: dask worker {address}") from None
+        most = jobs if jobs is not None and jobs > 0 else 2 * sum(client.ncores().values())
+        yield from _answers(question, paths, partial(_on_workers, question, client, most))
+
+
+def _answers(question: Question, paths: Sequence[str], attempt: Callable[[list[Task], list[Task]], Iterator[Answer]]) -> Iterator[Answer]:
+    """Answers as they are ready, in any order.
+
+    `attempt` yields the answers for some traces, and puts those under way while a process was killed into its second list. Which of them was
+    to blame is not known, so each is solved again, alone: it is the one whose process is killed again.
+    """
+    suspects: list[Task] = []
+    yield from attempt([*enumerate(paths)], suspects)
+    for task in suspects:
+        again: list[Task] = []
+        yield from attempt([task], again)
+        for _ in again:
+            yield question.failed(*task, SolverError(KILLED))
+
+
+def _in_processes(question: Question, jobs: int, tasks: list[Task], killed: list[Task]) -> Iterator[Answer]:
+    """An attempt with joblib. Where a process is killed, joblib gives up all that is under way; the rest goes on in new processes."""
+    from joblib import Parallel, delayed
+
+    waiting = dict(tasks)
+    while waiting:
+        begun: list[int] = []
+        work = (delayed(question.answer)(*task) for task in _noted([*waiting.items()], begun))
+        try:
+            for answer in Parallel(min(jobs, max(2, len(waiting))), batch_size=1, return_as="generator_unordered")(work):
+                del waiting[answer.number]
+                yield answer
+        except BrokenExecutor:
+            killed += [(number, waiting.pop(number)) for number in begun if number in waiting]
+
+
+def _noted(tasks: Iterable[Task], begun: list[int]) -> Iterator[Task]:
+    """The tasks, while it is written down which were begun."""
+    for task in tasks:
+        begun.append(task[0])
+        yield task
+
+
+def _on_workers(question: Question, client: Client, most: int, tasks: list[Task], killed: list[Task]) -> Iterator[Answer]:
+    """An attempt on Dask, with so many traces at most sent at a time. They are read here: workers need not share the disk.
+
+    This is Dask's own interface, as joblib's backend for Dask waits for ever when a worker is killed.
+    """
+    from distributed import KilledWorker, as_completed
+
+    sent: dict[Future[Answer], Task] = {}
+    ready = as_completed(loop=client.loop)
+
+    def received(futures: Iterable[Future[Answer]]) -> Iterator[Answer]:
+        for future in futures:
+            task = sent.pop(future)
+            try:
+                yield future.result()
+            except KilledWorker:
+                killed.append(task)
+            except CancelledError:
+                yield question.failed(*task, SolverError(LOST))
+            except Exception as error:  # of the cluster, as `answer` catches those of the trace
+                mend = "install the same ssh-abduction where the scheduler and its workers run"
+                yield question.failed(*task, SolverError(f"cluster: expected an answer, got {type(error).__name__}: {error}; {mend}"))
+
+    for number, path in tasks:
+        try:
+            if client.status != "running":
+                raise SolverError(LOST)
+            future = client.submit(_on_worker, question, number, path, Trace.load(path), pure=False)
+        except Exception as error:
+            yield question.failed(number, path, error)
+            continue
+        sent[future] = number, path
+        ready.add(future)
+        yield from received(islice(ready, max(0, len(sent) + 1 - most)))
+    yield from received(ready)
+    for task in sent.values():  # Dask says nothing about these once the scheduler is gone
+        yield question.failed(*task, SolverError(LOST))
+
+
+def _on_worker(question: Question, number: int, path: str, trace: Trace) -> Answer:
+    """The answer, on a Dask worker. A worker runs on when its client has gone, so the search looks now and then whether it has."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    task = worker.state.tasks[worker.get_current_task()]
+    return question.answer(number, path, trace, lambda: task.state == "cancelled")
+
+
+def _forget_memory() -> None:
+    """Count the peak of memory anew, after what earlier traces left is given back. Where this is not Linux, the peak stays."""
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+@contextlib.contextmanager
+def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], None]]]:
+    """How to print a line, and how to move the bar, which is on stderr if that is a terminal."""
+    if not sys.stderr.isatty():
+        yield partial(print, flush=True), lambda: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=console, redirect_stdout=False) as progress:
+        task = progress.add_task("traces", total=total)
+        if sys.stdout.isatty():  # both are seen: the line goes above the bar
+            yield partial(console.out, highlight=False), partial(progress.advance, task)
+        else:
+            yield partial(print, flush=True), partial(progress.advance, task)

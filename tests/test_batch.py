@@ -1,0 +1,266 @@
+"""Many traces at once: order, errors, killed processes, Ctrl-C; the same results here, in processes and on a Dask cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import dask
+import pytest
+from distributed import LocalCluster
+from worlds import TOURS, drive, rectangle
+
+from ssh_abduction import Theory, Trace
+from ssh_abduction.cli import batch, main
+from ssh_abduction.cli.batch import Answer, Question
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+ENDLESS = ["--boundary", "none", "--path-order", "partial", "--prefer", "", "-n", "0"]  # a theory in which slow.jsonl has maps without end
+QUESTION = Question(Theory.topological(), limit=None, maps=100, memory=None, json=False)
+
+
+class Deadly(Question):
+    """Kills the process that is to solve a trace of this name, as the system does when memory runs out."""
+
+    def answer(self, number: int, path: str, *rest: Any) -> Answer:
+        if "deadly" in path:
+            time.sleep(0.3)  # others shall be under way
+            os.kill(os.getpid(), signal.SIGKILL)
+        return Question.answer(self, number, path, *rest)
+
+
+@pytest.fixture
+def traces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of traces, from here on the working directory."""
+    for name, trace in {
+        "quick": rectangle(8),
+        "slow": rectangle(40),
+        "comb": drive(*TOURS["comb"]),
+        "deadly": rectangle(8),
+        "impossible": Trace.from_steps("xyabcde", ["right", "travel", "travel", "around", "around", "travel"]),
+    }.items():
+        trace.save(tmp_path / f"{name}.jsonl")
+    (tmp_path / "broken.jsonl").write_text('{"format": "ssh-trace", "version": 1}\n{"view": }\n')
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """The address of a Dask scheduler with one worker of one thread, in a process of its own."""
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
+    ):
+        yield cluster.scheduler_address
+
+
+def without_seconds(text: str) -> str:
+    return re.sub(r'"seconds": {[^}]*}|\d+\.\d\d s', "_ s", text)
+
+
+def test_each_trace_has_its_line_in_order(traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["solve", "comb.jsonl", "broken.jsonl", "quick.jsonl", "missing.jsonl", "impossible.jsonl"]) == 1
+    out, err = capsys.readouterr()
+    comb, broken, quick, missing, impossible = out.splitlines()
+    assert (
+        without_seconds(comb) == "comb.jsonl: optimal: 19 dstates, 10 places, 4 paths; 2 minimal maps; _ s, 22 of 22 steps given to clingo"
+    )
+    assert broken.startswith("broken.jsonl: error: broken.jsonl:2: line: expected one JSON object, got broken JSON")
+    assert quick.startswith("quick.jsonl: optimal: 8 dstates, 4 places, 4 paths; 1 minimal map;")
+    assert missing.startswith("missing.jsonl: error: missing.jsonl: expected a readable trace file")
+    assert impossible.startswith("impossible.jsonl: unsatisfiable: no map satisfies the axioms: in steps 2 to 5 these clash:")
+    assert err == "ssh-abduction: errors in 2 of 5 traces, on their lines\n"
+
+
+def test_a_line_says_what_the_single_trace_says(traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["quick.jsonl"], ["impossible.jsonl"], ["slow.jsonl", "--time-limit", "1e-9"]):
+        code = main(["solve", *words])
+        alone = capsys.readouterr().out.splitlines()[0]
+        assert main(["solve", *words, "--jobs", "1"]) == code
+        assert without_seconds(capsys.readouterr().out) == without_seconds(f"{words[0]}: {alone}\n")
+
+
+def test_json_lines_are_the_single_objects(traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = ["comb.jsonl", "impossible.jsonl", "quick.jsonl"]
+    alone = []
+    for path in paths:
+        main(["solve", path, "--json"])
+        alone.append(json.loads(capsys.readouterr().out))
+    assert main(["solve", *paths, "broken.jsonl", "--json"]) == 1
+    *lines, broken = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [[*line] for line in lines] == [["trace", *data] for data in alone]
+    for line, path, data in zip(lines, paths, alone, strict=True):
+        assert {**line, "seconds": None} == {"trace": path, **data, "seconds": None}
+    assert [*broken] == ["trace", "status", "error"]
+    assert (broken["trace"], broken["status"]) == ("broken.jsonl", "error")
+    assert broken["error"].startswith("broken.jsonl:2: line: expected one JSON object")
+    (traces / "maps.json").write_text(json.dumps(lines[2]))
+    assert main(["check", "quick.jsonl", "maps.json"]) == 0  # a line is what the other verbs read
+
+
+def test_everywhere_the_same(traces: Path, scheduler: str, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [f"{name}.jsonl" for name in ("comb", "quick", "broken", "impossible", "quick")]
+    shown = {}
+    for where in ((), ("--jobs", "2"), ("--scheduler", scheduler), ("--scheduler", scheduler, "--jobs", "1")):
+        assert main(["solve", *paths, "--json", *where]) == 1
+        shown[where] = without_seconds(capsys.readouterr().out)
+    assert shown[()].count("\n") == len(paths)
+    assert len(set(shown.values())) == 1
+
+
+@pytest.mark.parametrize(
+    ("paths", "code"),
+    [("quick quick", 0), ("quick impossible quick", 20), ("impossible broken", 1), ("slow impossible", 30)],
+)
+def test_the_worst_exit_code(paths: str, code: int, traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    limit = ["--time-limit", "1e-9"] if code == 30 else []
+    assert main(["solve", *(f"{name}.jsonl" for name in paths.split()), *limit]) == code
+    assert (capsys.readouterr().err == "") == (code != 1)
+
+
+def test_wrong_choices_are_one_line(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(batch, "PATIENCE", 0.5)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        nobody = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    both = ["quick.jsonl", "comb.jsonl"]
+    for words, message in (
+        ([*both, "--jobs", "0"], r"--jobs: expected .* got 0; leave it out for 1"),
+        (["quick.jsonl", "-"], r"-: expected files .* got standard input; save it to a file"),
+        (["-", "--jobs", "2"], r"-: expected files .* got standard input; save it to a file"),
+        ([*both, "--theory", "causal", "--boundary", "strict"], r"boundary: expected none with level=causal.*"),
+        ([*both, "--scheduler", nobody], rf"--scheduler: expected a Dask scheduler at {nobody}, got none \(.*\); start one with: .*"),
+        ([*both, "--scheduler", "elsewhere"], r"--scheduler: expected a Dask scheduler at elsewhere, got none \(missing port.*"),
+    ):
+        assert main(["solve", *words]) == 1
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert re.fullmatch(rf"ssh-abduction: {message}\n", err)
+
+
+def test_a_scheduler_without_workers(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(batch, "PATIENCE", 0.5)
+    with LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster:
+        assert main(["solve", "quick.jsonl", "--scheduler", cluster.scheduler_address]) == 1
+    assert re.fullmatch(r"ssh-abduction: --scheduler: expected a worker, got none in 0.5 s; start one with: .*\n", capsys.readouterr().err)
+
+
+def test_without_the_extra(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert main(["solve", "quick.jsonl", "--scheduler", "tcp://127.0.0.1:1"]) == 1
+    assert capsys.readouterr().err.endswith("; pip install 'ssh-abduction[cluster]'\n")
+
+
+def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(path: str) -> Trace:
+        raise MemoryError("no room for\nso many steps")
+
+    monkeypatch.setattr(Trace, "load", load)
+    assert QUESTION.answer(3, "a\nb.jsonl") == Answer(3, r"'a\nb.jsonl': error: MemoryError: no room for so many steps", 1)
+
+
+def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler: str) -> None:
+    deadly = Deadly(*(getattr(QUESTION, name) for name in Question.__slots__))
+    paths = [f"{name}.jsonl" for name in ("quick", "deadly", "comb", "quick")]
+    for answers in (batch._here(deadly, paths, 2), batch._on_cluster(deadly, paths, scheduler, None)):
+        lines = {answer.number: answer.line for answer in answers}
+        assert sorted(lines) == [*range(len(paths))]
+        for number, path in enumerate(paths):
+            assert lines[number].startswith(f"{path}: {'error: process: expected' if 'deadly' in path else 'optimal'}")
+
+
+def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler: str) -> None:
+    theory = Theory.topological().replace(boundary="none", path_order="partial", prefer=())
+    endless = Question(theory, limit=30, maps=0, memory=None, json=False)
+    answers = batch._on_cluster(endless, ["quick.jsonl", "slow.jsonl"], scheduler, None)
+    assert next(answers).number == 0
+    time.sleep(0.5)  # the only thread of the worker is at the slow one
+    answers.close()
+    began = time.monotonic()
+    assert [answer.code for answer in batch._on_cluster(QUESTION, ["comb.jsonl"], scheduler, None)] == [0]
+    assert time.monotonic() - began < 15
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux forgets the peak of memory")
+def test_memory_is_counted_for_each_trace(traces: Path) -> None:
+    command = shlex.join([sys.executable, "-m", "ssh_abduction", "solve", "quick.jsonl", "slow.jsonl", "quick.jsonl", *ENDLESS, "--json"])
+    command += " --memory-limit 100; exit"  # run by a shell: a process inherits the peak of the one that starts it, which is large here
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [line.get("stopped") for line in lines] == [None, "memory limit", None]
+
+
+def test_ctrl_c_prints_what_waited_for_its_turn(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def answers(*_: object) -> Iterator[Answer]:
+        yield Answer(0, "first", 0)
+        yield Answer(3, "fourth", 0)
+        yield Answer(2, "third", 20)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(10)
+
+    monkeypatch.setattr(batch, "_here", answers)
+    assert main(["solve", *["quick.jsonl"] * 5]) == 130
+    assert capsys.readouterr() == ("first\nthird\nfourth\n", "ssh-abduction: interrupted: 2 of 5 traces not finished\n")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_ctrl_c_ends_the_processes(jobs: str, traces: Path) -> None:
+    paths = ["quick.jsonl", "slow.jsonl", "quick.jsonl", "slow.jsonl", "slow.jsonl"]
+    command = [sys.executable, "-m", "ssh_abduction", "solve", *paths, *ENDLESS, "--jobs", jobs]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        time.sleep(0.5)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        out, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    lines = [first, *out.splitlines()]
+    assert first.startswith("quick.jsonl: optimal")
+    unfinished = len(paths) - sum("(interrupted)" not in line for line in lines)
+    assert err == f"ssh-abduction: interrupted: {unfinished} of 5 traces not finished\n"
+    if jobs == "1":
+        assert re.match(r"slow.jsonl: \w+.*\(interrupted\)", lines[1])
+        assert unfinished == 4
+    deadline = time.monotonic() + 20
+    with contextlib.suppress(ProcessLookupError):
+        while time.monotonic() < deadline:
+            os.killpg(process.pid, 0)
+            time.sleep(0.1)
+        pytest.fail("processes are left")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="terminals")
+@pytest.mark.parametrize("seen", [False, True], ids=["results to a pipe", "results to the terminal"])
+def test_the_bar_is_on_the_terminal(seen: bool, traces: Path) -> None:
+    import pty
+
+    master, slave = pty.openpty()
+    command = [sys.executable, "-m", "ssh_abduction", "solve", "quick.jsonl", "broken.jsonl", "comb.jsonl"]
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "60"}
+    with subprocess.Popen(command, stdout=slave if seen else subprocess.PIPE, stderr=slave, env=environment, text=True) as process:
+        os.close(slave)
+        shown = b""
+        with contextlib.suppress(OSError):  # the terminal is gone when the program is
+            while chunk := os.read(master, 4096):
+                shown += chunk
+        results = "" if process.stdout is None else process.stdout.read()
+        assert process.wait(30) == 1
+    os.close(master)
+    text = shown.decode()
+    assert "3/3" in text
+    whole = "quick.jsonl: optimal: 8 dstates, 4 places, 4 paths; 1 minimal map; _ s, 9 of 9 steps given to clingo"
+    assert (f"\x1b[2K{whole}" in without_seconds(text)) == seen  # where the bar was wiped away
+    assert (whole in without_seconds(results)) == (not seen)
