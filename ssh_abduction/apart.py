@@ -15,7 +15,7 @@ dstates as they are, in every theory that holds the axioms functional_view and d
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.errors import SolverError, brief
+from ssh_abduction.errors import SolverError
 from ssh_abduction.trace import Trace
 
 SWAPS = 60  # attempts to better the clique, for each view
@@ -85,7 +85,7 @@ def _filled(apart: Matrix, kept: list[int], random: np.random.Generator) -> list
 class Certificate:
     """Why no map has fewer dstates.
 
-    clique   steps that are pairwise apart, so that each is a dstate of its own: checked by `check`, without a solver
+    clique   steps that are pairwise apart, so that each is a dstate of its own; proof.check_bound checks it, without a solver
     refuted  numbers of dstates, from the size of the clique up, for which clingo found that there is no map
     """
 
@@ -105,36 +105,6 @@ class Certificate:
         """Plain data. Pairs that show different views at once need no word, and are left out."""
         words = [[i, j, list(word)] for (i, j), word in self.words(trace).items() if word]
         return {"clique": list(self.clique), "words": words, "refuted": list(self.refuted)}
-
-    @staticmethod
-    def check(data: Any, trace: Trace) -> Certificate:
-        """The certificate that `to_dict` wrote, after checking each of its words on the trace. Raises SolverError where it is wrong."""
-        if not isinstance(data, Mapping) or not isinstance(data.get("clique"), list):
-            raise SolverError(f"certificate: expected an object with a clique, got {brief(data)}; solve the trace again")
-        steps, refuted = data["clique"], data.get("refuted", [])
-        for step in steps:
-            if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < len(trace):
-                raise SolverError(f"certificate: clique: expected steps of the trace, 0 to {len(trace) - 1}, got {brief(step)}")
-        if len(set(steps)) < len(steps):
-            raise SolverError("certificate: clique: expected each step once")
-        if refuted != list(range(len(steps), len(steps) + len(refuted))):
-            raise SolverError(f"certificate: refuted: expected the numbers from {len(steps)} up, without a gap, got {brief(refuted)}")
-        words = {frozenset(entry[:2]): entry[2] for entry in data.get("words", [])}
-        for i, j in combinations(steps, 2):
-            _apart_by(trace, i, j, words.get(frozenset((i, j)), []))
-        return Certificate(tuple(steps), tuple(refuted))
-
-
-def _apart_by(trace: Trace, i: int, j: int, word: Sequence[str]) -> None:
-    """Check that these actions were done from both steps, and led to different views."""
-    for k, name in enumerate(word):
-        for step in (i, j):
-            action = trace.steps[step + k].action if step + k < len(trace) else None
-            if action is None or action.name != name:
-                was = brief(action.name) if action else "the end of the trace"
-                raise SolverError(f"certificate: steps {i} and {j}: expected {brief(name)} after step {step + k}, got {was}")
-    if trace.steps[i + len(word)].view == trace.steps[j + len(word)].view:
-        raise SolverError(f"certificate: steps {i} and {j}: expected different views after {brief(list(word))}, got the same")
 
 
 def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:

@@ -33,8 +33,10 @@ class Speedups:
     def without(cls, names: str | Iterable[str]) -> Speedups:
         """All but these. Raises SolverError."""
         off = [name for name in (names.split(",") if isinstance(names, str) else names) if name]
-        known = [f.name for f in fields(cls)]
         for name in off:
-            if name not in known:
-                raise SolverError(f"speedups: expected names out of {', '.join(known)}, got {brief(name)}")
+            if name not in SPEEDUPS:
+                raise SolverError(f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(name)}")
         return cls(**dict.fromkeys(off, False))
+
+
+SPEEDUPS = tuple(f.name for f in fields(Speedups))

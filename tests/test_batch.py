@@ -21,13 +21,13 @@ import pytest
 from distributed import LocalCluster
 from worlds import TOURS, drive, rectangle
 
-from ssh_abduction import Theory, Trace
+from ssh_abduction import Speedups, Theory, Trace
 from ssh_abduction.cli import batch, main
 from ssh_abduction.cli.batch import Answer, Question
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ENDLESS = ["--boundary", "none", "--path-order", "partial", "--prefer", "", "-n", "0"]  # a theory in which slow.jsonl has maps without end
-QUESTION = Question(Theory.topological(), limit=None, maps=100, memory=None, json=False)
+QUESTION = Question(Theory.topological(), limit=None, maps=100, memory=None, speedups=Speedups(), json=False)
 
 
 class Deadly(Question):
@@ -183,7 +183,7 @@ def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler:
 
 def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler: str) -> None:
     theory = Theory.topological().replace(boundary="none", path_order="partial", prefer=())
-    endless = Question(theory, limit=30, maps=0, memory=None, json=False)
+    endless = Question(theory, limit=30, maps=0, memory=None, speedups=Speedups(), json=False)
     answers = batch._on_cluster(endless, ["quick.jsonl", "slow.jsonl"], scheduler, None)
     assert next(answers).number == 0
     time.sleep(0.5)  # the only thread of the worker is at the slow one

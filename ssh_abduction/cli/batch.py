@@ -27,6 +27,7 @@ from ssh_abduction.cli.solve import dump, ending, exit_code, explained, on_ctrl_
 from ssh_abduction.cli.text import headline
 from ssh_abduction.errors import SolverError, SSHError, named
 from ssh_abduction.solver import Search
+from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
@@ -50,12 +51,13 @@ class Answer(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked about each trace: limit, maps and memory as of Search. Plain data, as it travels to other processes and machines."""
+    """What is asked about each trace: limit, maps, memory and speedups as of Search. Plain data, as it travels to other processes and machines."""
 
     theory: Theory
     limit: float | None
     maps: int
     memory: int | None
+    speedups: Speedups
     json: bool
 
     def answer(self, number: int, path: str, trace: Trace | None = None, given_up: Callable[[], bool] = lambda: False) -> Answer:
@@ -73,13 +75,15 @@ class Question:
             if given_up():
                 search.interrupt()
 
-        search = Search(trace, self.theory, limit=self.limit, maps=self.maps, memory=self.memory, on_progress=on_progress)
+        search = Search(
+            trace, self.theory, limit=self.limit, maps=self.maps, memory=self.memory, speedups=self.speedups, on_progress=on_progress
+        )
         with on_ctrl_c(search.interrupt):
             maps = [ssh_map.to_dict() for ssh_map in search if self.json]
             explanation = explained(search)
         solution = search.solution()
         if self.json:
-            line = dump({"trace": path, **opening(search), "maps": maps, **ending(solution, search.count, explanation)})
+            line = dump({"trace": path, **opening(search), "maps": maps, **ending(search, solution, explanation)})
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
         return Answer(number, line, exit_code(solution))
@@ -97,7 +101,8 @@ def run(options: argparse.Namespace) -> int:
         raise SSHError("-: expected files where there are several traces, --jobs or --scheduler, got standard input; save it to a file")
     if options.jobs == 0:
         raise SSHError("--jobs: expected how many traces to solve at a time, or -1 for one a core, got 0; leave it out for 1")
-    question = Question(theory_of(options), options.time_limit, options.maps, options.memory_limit, options.json)
+    speedups = Speedups.without(options.without_speedups)
+    question = Question(theory_of(options), options.time_limit, options.maps, options.memory_limit, speedups, options.json)
     if options.scheduler is None:
         answers = _here(question, paths, options.jobs or 1)
     else:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from ssh_abduction.checker import check
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.errors import MapError
 from ssh_abduction.maps import maps_of, read_json
+from ssh_abduction.proof import check_bound
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
@@ -18,6 +21,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser("check", help="do these maps satisfy the axioms?", description=text)
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument("maps", help="what solve --json printed, or one saved map")
+    parser.add_argument("--bound", action="store_true", help="check the proof that no map has fewer dstates, too")
     add_theory(parser)
     parser.set_defaults(run=run, theory=None)
     parser.epilog = "Without --theory, the theory is the one that the file of maps was solved under; other flags are laid over it."
@@ -37,4 +41,27 @@ def run(options: argparse.Namespace) -> int:
             steps = f"{'step' if len(v.steps) == 1 else 'steps'} {', '.join(map(str, v.steps))}: " if v.steps else ""
             print(f"map {i + 1}: {v.axiom}: {steps}{v.message}")
     print(f"{len(maps) - broken} of {len(maps)} maps satisfy the {len(theory.resolve(trace).axioms)} axioms")
-    return EXIT_VIOLATED if broken else 0
+    proven = not options.bound or _bound(trace, data, theory, min((len(m.dstates) for m in maps), default=None))
+    return EXIT_VIOLATED if broken or not proven else 0
+
+
+def _bound(trace: Trace, data: Any, theory: Theory, fewest: int | None) -> bool:
+    """Print what the certificate of the file proves. Says whether it holds."""
+    if {"functional_view", "deterministic"} - set(theory.axioms):
+        raise MapError("bound: expected a theory with the axioms functional_view and deterministic, which the proof rests on")
+    if not isinstance(data, dict) or "certificate" not in data:
+        raise MapError("certificate: expected one beside the maps, got none; use what solve --json printed")
+    bound = check_bound(trace, data["certificate"])
+    for fault in bound.faults:
+        print(f"bound: {fault}")
+    if bound.faults:
+        return False
+    pairs = bound.dstates * (bound.dstates - 1) // 2
+    print(f"at least {bound.dstates} dstates: as many steps, of which no two can be one dstate ({pairs} pairs checked)")
+    total = bound.dstates + len(bound.refuted)
+    if bound.refuted:
+        sizes = f"{bound.refuted[0]} to {total - 1}" if len(bound.refuted) > 1 else str(bound.refuted[0])
+        print(f"at least {total} dstates, if clingo is right that there is no map of {sizes}")
+    if fewest is not None:
+        print(f"the maps have {fewest}" + (": no map has fewer" if fewest == total else f", {fewest - total} more than proven"))
+    return fewest is None or fewest >= total

@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from itertools import islice
 from typing import Any
 
@@ -17,6 +18,7 @@ from ssh_abduction.cli.text import describe, differences, headline
 from ssh_abduction.explain import Explanation, Interrupted, explain
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import Progress, Search, Solution, Status
+from ssh_abduction.speedups import SPEEDUPS, Speedups
 from ssh_abduction.trace import Trace
 
 EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}
@@ -32,6 +34,9 @@ def add_parser(verbs: Verbs) -> None:
         "--json", action="store_true", help="print the solution as JSON, map by map as they are found; of many traces, a line each"
     )
     parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds with the best answer so far")
+    parser.add_argument(
+        "--without-speedups", default="", metavar="NAMES", help=f"leave these out, of {', '.join(SPEEDUPS)}; commas between"
+    )
     parser.add_argument("--memory-limit", type=int, metavar="MIB", help="stop when the process has used so much memory")
     many = parser.add_argument_group(
         "many traces",
@@ -59,6 +64,7 @@ def run(options: argparse.Namespace) -> int:
             limit=options.time_limit,
             maps=options.maps,
             memory=options.memory_limit,
+            speedups=Speedups.without(options.without_speedups),
             on_progress=on_progress,
         )
         with on_ctrl_c(search.interrupt):
@@ -105,7 +111,7 @@ def _print_json(search: Search) -> list[SSHMap]:
 
 
 def _print_end(search: Search, solution: Solution, explanation: Explanation | None) -> None:
-    print("," + dump(ending(solution, search.count, explanation))[1:])
+    print("," + dump(ending(search, solution, explanation))[1:])
 
 
 def opening(search: Search) -> dict[str, Any]:
@@ -113,17 +119,20 @@ def opening(search: Search) -> dict[str, Any]:
     return {"theory": search.theory.to_dict(), "steps": len(search.trace)}
 
 
-def ending(solution: Solution, count: int, explanation: Explanation | None) -> dict[str, Any]:
-    """What the JSON of a solution says after its maps, which were `count`."""
+def ending(search: Search, solution: Solution, explanation: Explanation | None) -> dict[str, Any]:
+    """What the JSON of a solution says after its maps."""
     end: dict[str, Any] = {
         "status": solution.status.value,
         "complete": solution.complete,
-        "count": count,
+        "count": search.count,
         "cost": solution.cost.to_dict() if solution.cost else None,
         "bound": solution.bound.to_dict(),
         "prefix": solution.prefix,
+        "grounding": asdict(solution.grounding),
         "seconds": {k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")},
     }
+    if solution.certificate:
+        end["certificate"] = solution.certificate.to_dict(search.trace)
     if solution.stopped:
         end["stopped"] = solution.stopped
     if solution.partial:
