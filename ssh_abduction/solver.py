@@ -121,6 +121,14 @@ class Seconds:
 
 
 @dataclass(frozen=True, slots=True)
+class Grounding:
+    """How large the ground program was at the end: its rules and atoms."""
+
+    rules: int
+    atoms: int
+
+
+@dataclass(frozen=True, slots=True)
 class Progress:
     """How far a search is: the prefix it works on, the best cost and the bound so far, and the maps found."""
 
@@ -143,6 +151,7 @@ class Solution:
     theory     the theory, with star settled
     steps      length of the trace
     prefix     how many of its first steps had to be given to clingo
+    grounding  how large the program was that clingo solved
     stopped    why the search ended before it was complete, else None
     partial    where no map of the whole trace was found: the best map of its first steps
     """
@@ -156,6 +165,7 @@ class Solution:
     steps: int
     prefix: int
     seconds: Seconds
+    grounding: Grounding
     stopped: Stop | None = None
     partial: SSHMap | None = None
 
@@ -302,6 +312,7 @@ class Search:
             steps=len(self.trace),
             prefix=self.prefix,
             seconds=Seconds(self._watch.elapsed(), self._engine.ground_seconds, self._engine.solve_seconds),
+            grounding=self._engine.grounding(),
             stopped=self.stopped,
             partial=None if self.best else self.partial,
         )
@@ -503,6 +514,11 @@ class _Engine:
         for name in facts.encoding_names(theory):
             self._control.load(encodings.path(name))
         self._control.add("base", [], facts.theory_facts(theory, paths))
+
+    def grounding(self) -> Grounding:
+        """How large the program is that was last solved."""
+        program = self._control.statistics.get("problem", {}).get("lp", {})
+        return Grounding(int(program.get("rules", 0)), int(program.get("atoms", 0)))
 
     def with_paths(self, paths: int) -> _Engine:
         """Another control for the same prefix, with more names for paths."""
