@@ -1,14 +1,23 @@
-"""The benchmarks measure what they say: the peers explain the trace, with as few states as they promise."""
+"""The benchmarks measure what they say: answers are checked, and limits hold."""
 
 from __future__ import annotations
 
 import random
+import re
+from typing import Any
 
+import bench
 import pytest
+import table
 from instances import moore
 from peers import PEERS, Machine, Words
+from suite import SUITE
 
 from ssh_abduction import Theory, Trace, solve
+
+ALWAYS = {"instance", "theory", "tool", "seed", "status", "reason"}
+MEASURED = {"images", "true_dstates", "seconds", "cpu", "memory"}
+OURS = {"dstates", "bound", "proven", "prefix", "ground", "solve", "rules", "atoms"}
 
 
 def fewest(trace: Trace) -> int:
@@ -50,3 +59,70 @@ def test_a_machine_that_shows_something_else_is_found_out() -> None:
 def test_words_ask_for_the_view_bit_by_bit() -> None:
     words = Words(Trace.from_steps(["a", "b", "c", "b"], ["travel", "right", "travel"]))
     assert [list(words.at(t)) for t in (0, 2)] == [[([], False), (["2"], False)], [(["0", "1"], False), (["0", "1", "2"], True)]]
+
+
+def test_a_cell_has_all_its_fields() -> None:
+    ours = bench.run("ssh-abduction", SUITE["full aces3"], 0, 5, 4096)
+    assert ours.keys() == ALWAYS | MEASURED | OURS
+    assert (ours["status"], ours["dstates"], ours["proven"], ours["images"], ours["theory"]) == ("ok", 19, True, 23, "full")
+    theirs = bench.run("plain.lp", SUITE["rectangle n=400"], 0, 5, 4096)
+    assert theirs.keys() == ALWAYS | MEASURED | {"dstates", "proven"}
+    assert (theirs["status"], theirs["dstates"], theirs["true_dstates"]) == ("ok", 4, 8)
+
+
+def test_a_cell_ends_at_its_limit() -> None:
+    late = bench.run("plain.lp", SUITE["maze 5x5 n=1600"], 0, 0.5, 4096)
+    assert (late["status"], late["seconds"]) == ("timeout", 0.5)
+    assert 0 < late["cpu"] < 1
+    assert bench.run("plain.lp", SUITE["full aces3"], 0, 0.5, 4096)["status"] == "not applicable"
+
+
+def cell(tool: str, status: str = "ok", seed: int = 0, **fields: Any) -> dict[str, Any]:
+    return {"instance": "x", "tool": tool, "seed": seed, "status": status, "reason": "", "images": 9, **fields}
+
+
+def results(*cells: dict[str, Any]) -> dict[str, Any]:
+    return {"limit": 10, "cells": list(cells)}
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "row"),
+    [
+        ({"seconds": 2}, {"seconds": 5}, "| 4 | 2.0 s | 7 | 5.0 s, 8 MB, ×2.5 |"),
+        ({"seconds": 2}, {"status": "timeout", "seconds": 10, "proven": False}, "| 4 | 2.0 s | 7 | > 10 s, 8 MB, >×5.0 |"),
+        (
+            {"status": "timeout", "seconds": 10, "proven": False, "bound": 3, "dstates": 6},
+            {"status": "timeout", "seconds": 10, "proven": False},
+            "| 3 – 4 | > 10 s | 7 | > 10 s, 8 MB |",
+        ),
+        ({"status": "timeout", "seconds": 10, "proven": False}, {"seconds": 5}, "| 4 | > 10 s | 7 | 5.0 s, 8 MB, <×0.5 |"),
+        ({"seconds": 2}, {"seconds": 1, "proven": False, "dstates": 9}, "| 4 | 2.0 s | 7 | 1.0 s, 8 MB, ×0.5, 9 states |"),
+        ({"seconds": 2}, {"status": "error", "seconds": 1, "reason": "it broke", "proven": False}, "| 4 | 2.0 s | 7 | error¹, 8 MB |"),
+    ],
+)
+def test_a_row_of_the_table(ours: dict[str, Any], theirs: dict[str, Any], row: str) -> None:
+    found = table.times(
+        results(
+            cell("ssh-abduction", **{"memory": 7, "dstates": 4, "proven": True, **ours}),
+            cell("p", **{"memory": 8, "dstates": 4, "proven": True, **theirs}),
+        )
+    )
+    assert row in re.sub(" +", " ", found)
+
+
+def test_many_seeds_show_the_median_and_how_many_were_solved() -> None:
+    seconds = (1, 3, 10)
+    cells = [
+        cell("ssh-abduction", "ok" if s < 10 else "timeout", seed, seconds=s, memory=5, proven=s < 10, dstates=4)
+        for seed, s in enumerate(seconds)
+    ]
+    assert "3.0 s (2 of 3)" in table.times(results(*cells))
+
+
+def test_answers_that_contradict_each_other_are_named() -> None:
+    proven, fewer, bound = cell("a", dstates=4, proven=True), cell("b", dstates=3, proven=False), cell("c", "timeout", bound=5)
+    assert table.contradictions(results(proven, cell("b", dstates=5, proven=False))) == []
+    assert table.contradictions(results(proven, fewer)) == ["x, seed 0: a proved 4 states, b found 3"]
+    assert table.contradictions(results(proven, bound)) == ["x, seed 0: c proved 5 states, a found 4"]
+    assert table.contradictions(results(proven, {**fewer, "seed": 1})) == []
+    assert table.contradictions(results(cell("a", "wrong", reason="no"))) == ["x, seed 0: a: no"]
