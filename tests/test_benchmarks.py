@@ -1,13 +1,17 @@
-"""The benchmarks measure what they say: answers are checked, and limits hold."""
+"""The benchmarks measure what they say: answers are checked, limits hold, and the README shows a stored run."""
 
 from __future__ import annotations
 
+import json
 import random
 import re
+from pathlib import Path
 from typing import Any
 
 import bench
+import plot
 import pytest
+import readme
 import table
 from instances import moore
 from peers import PEERS, Machine, Words
@@ -15,6 +19,8 @@ from suite import SUITE
 
 from ssh_abduction import Theory, Trace, solve
 
+ROOT = Path(__file__).parent.parent
+STORED = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
 ALWAYS = {"instance", "theory", "tool", "seed", "status", "reason"}
 MEASURED = {"images", "true_dstates", "seconds", "cpu", "memory"}
 OURS = {"dstates", "bound", "proven", "prefix", "ground", "solve", "rules", "atoms"}
@@ -126,3 +132,26 @@ def test_answers_that_contradict_each_other_are_named() -> None:
     assert table.contradictions(results(proven, bound)) == ["x, seed 0: c proved 5 states, a found 4"]
     assert table.contradictions(results(proven, {**fewer, "seed": 1})) == []
     assert table.contradictions(results(cell("a", "wrong", reason="no"))) == ["x, seed 0: a: no"]
+
+
+@pytest.mark.parametrize("path", STORED, ids=lambda path: path.name)
+def test_a_stored_run_has_its_fields_and_no_contradiction(path: Path) -> None:
+    run = json.loads(path.read_text())
+    assert run.keys() == {"date", "limit", "memory", "seeds", "machine", "packages", "cells"}
+    assert run["machine"].keys() == {"cpu", "cores", "memory", "system", "python"}
+    for cell in run["cells"]:
+        assert cell.keys() >= ALWAYS
+        assert cell.keys() >= MEASURED or cell["status"] in ("not applicable", "not installed", "error")
+        assert cell["status"] != "ok" or cell.keys() >= {"dstates", "proven"} | (OURS if cell["tool"] == "ssh-abduction" else set())
+    assert table.contradictions(run) == []
+
+
+def test_the_readme_shows_a_stored_run(tmp_path: Path) -> None:
+    text = (ROOT / "README.md").read_text()
+    shown = re.search(r"<!-- bench:begin -->.*\]\((benchmarks/results/.*\.json)\).*<!-- bench:end -->", text, re.DOTALL)
+    assert shown
+    run = json.loads((ROOT / shown[1]).read_text())
+    assert readme.rewritten(text, run, shown[1]) == text
+    picture = tmp_path / "growth.png"
+    plot.draw(run, picture)
+    assert picture.stat().st_size > 10_000
