@@ -1,12 +1,13 @@
 # make demo   install what the lock says into .venv, solve a real route and show the map
-# make bench  times and ratios, measured on this machine
+# make bench  time and memory on this machine, ours and those of peers from PyPI, as a table; the better part of an hour
+# make parts  times of single parts: circuits, images
 # make test   the same, with the tools of development: lint, types, layers, tests
 PYTHON ?= python3
 BIN := .venv/bin
 export PIP_CONSTRAINT := $(CURDIR)/requirements.lock
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint bench lock clean
+.PHONY: demo test lint bench parts lock clean
 
 demo: .venv/base
 	$(BIN)/python examples/demo.py out
@@ -20,12 +21,15 @@ lint: .venv/dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: .venv/base
+bench: .venv/bench
+	$(BIN)/python benchmarks/bench.py $(ARGS)
+
+parts: .venv/base
 	$(BIN)/python benchmarks/circuits.py
 	$(BIN)/python benchmarks/images.py
 
 lock: .venv/dev
-	$(BIN)/python -m uv pip compile --upgrade --universal --no-header --no-annotate --extra dev --python-version 3.11 -o requirements.lock pyproject.toml
+	$(BIN)/python -m uv pip compile --upgrade --universal --no-header --no-annotate --extra dev --extra bench --python-version 3.11 -o requirements.lock pyproject.toml
 
 .venv/base: pyproject.toml requirements.lock
 	$(PYTHON) -m venv .venv
@@ -36,6 +40,11 @@ lock: .venv/dev
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install -q -e '.[dev]'
 	touch $@ .venv/base
+
+# A peer that does not install is left out, and its cells of the table say so.
+.venv/bench: .venv/base
+	$(BIN)/pip install -q -e '.[bench]' || for peer in '-e .[plot]' aalpy dfainductor z3gi; do $(BIN)/pip install -q $$peer || true; done
+	touch $@
 
 clean:
 	rm -rf .venv out

@@ -1,0 +1,111 @@
+"""One tool on one trace, in a process of its own. It prints a line when the clock starts, and a line with what came of it.
+
+    python benchmarks/cell.py TOOL INSTANCE SEED SECONDS MIB
+
+The process is ended by a signal when its time is over. The clock does not run while programs are loaded, the trace is made, or the
+answer is checked: a map by the checker, a peer's machine by running it along the trace.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import json
+import resource
+import signal
+import sys
+import time
+from typing import Any
+
+from peers import PEERS, Machine, NotApplicableError
+from suite import SUITE
+from table import OURS
+
+from ssh_abduction import Solution, Theory, Trace, solve
+from ssh_abduction.checker import check
+from ssh_abduction.solver import Status, peak_memory
+
+AROUND = 300  # seconds for all that the clock does not count
+MARGIN = 0.1  # how much later than its own limit a solver of ours is ended: time to hand over what it has
+SHARE = 0.8  # of the memory is its own limit, for the same reason
+
+
+def main() -> None:
+    tool, name, seed, seconds, memory = sys.argv[1:]
+    instance, limit, space = SUITE[name], float(seconds), int(memory)
+    end_after(AROUND)
+    for module in PEERS[tool].modules if tool in PEERS else ():
+        importlib.import_module(module)
+    walk = instance.walk(int(seed))
+    trace, theory = walk.trace, instance.theory
+    resource.setrlimit(resource.RLIMIT_AS, (space * 2**20, -1))
+    say(images=len(trace), true_dstates=len(set(walk.truth)) or None, cpu=time.process_time())
+
+    began, cpu = time.perf_counter(), time.process_time()
+    answer: Any = None
+    outcome: dict[str, Any] = {}
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            if tool == OURS:
+                end_after(limit * (1 + MARGIN) + 1)
+                answer = solve(trace, theory, limit=limit, memory=int(SHARE * space), maps=1)
+            else:
+                end_after(limit)
+                answer = PEERS[tool].find(trace)
+    except NotApplicableError as error:
+        say(status="not applicable", reason=str(error))
+        return
+    except Exception as error:  # whatever a program raises is what came of it
+        outcome = {"status": "memory" if _of_memory(error) else "error", "reason": f"{type(error).__name__}: {error}"[:200]}
+    spent = {"seconds": time.perf_counter() - began, "cpu": time.process_time() - cpu, "memory": peak_memory()}
+    end_after(AROUND)
+    if not outcome:
+        outcome = of_solution(answer, trace, theory) if tool == OURS else of_machine(answer, trace, PEERS[tool].proves)
+    if outcome["status"] == "ok" and spent["seconds"] > limit:
+        outcome["status"] = "timeout"
+    say(**outcome, **{name: round(value, 5) for name, value in spent.items()})
+
+
+def of_solution(solution: Solution, trace: Trace, theory: Theory) -> dict[str, Any]:
+    """What came of our solver: a map that the checker finds right, the bound, and where the time went."""
+    wrong = [violation.message for ssh_map in solution.maps for violation in check(trace, ssh_map, theory)]
+    stopped = {"time limit": "timeout", "memory limit": "memory"}.get(str(solution.stopped), "error")
+    proven = solution.status is Status.OPTIMAL
+    return {
+        "status": "wrong" if wrong else "ok" if proven else stopped,
+        "reason": wrong[0] if wrong else "",
+        "dstates": solution.cost.dstates if solution.cost else None,
+        "bound": solution.bound.dstates,
+        "proven": proven,
+        "prefix": solution.prefix,
+        "ground": round(solution.seconds.ground, 5),
+        "solve": round(solution.seconds.solve, 5),
+        "rules": solution.grounding.rules,
+        "atoms": solution.grounding.atoms,
+    }
+
+
+def of_machine(machine: Machine, trace: Trace, proven: bool) -> dict[str, Any]:
+    """What came of a peer: a machine that shows the views of the trace."""
+    states = machine.states(trace)
+    if states is None:
+        return {"status": "wrong", "reason": "the machine does not show the views of the trace"}
+    return {"status": "ok", "reason": "", "dstates": states, "proven": proven}
+
+
+def end_after(seconds: float) -> None:
+    """From now on the process has so long; then the system ends it, whatever it is doing."""
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+
+
+def say(**record: Any) -> None:
+    print(json.dumps(record), flush=True)
+
+
+def _of_memory(error: Exception) -> bool:
+    return isinstance(error, MemoryError) or any(sign in str(error).lower() for sign in ("out of memory", "bad_alloc"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,231 @@
+"""Other programs that find small Moore machines, each as a function from a trace to the machine that it finds.
+
+The causal theory asks for the smallest deterministic Moore machine that explains one trace, and so do these. Each function is given
+the whole trace and nothing of ours, and says in its docstring how the trace is put to the program, and what its answer means.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from ssh_abduction import Trace
+
+
+class NotApplicableError(Exception):
+    """The program cannot be asked this; the message says why."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A Moore machine: where it starts, where an action leads, and what a state shows."""
+
+    start: Any
+    follow: Callable[[Any, str], Any]
+    shows: Callable[[Any], Any]
+
+    def states(self, trace: Trace) -> int | None:
+        """How many states it goes through when it does the actions of the trace, or None where it does not show the views of the trace."""
+        state, visited = self.start, set()
+        for step in trace:
+            if self.shows(state) != step.view:
+                return None
+            visited.add(state)
+            if step.action:
+                state = self.follow(state, step.action.name)
+        return len(visited)
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A program: what finds the machine, the modules it needs, the packages on PyPI they come from, and whether it proves its machine minimal."""
+
+    find: Callable[[Trace], Machine]
+    modules: tuple[str, ...]
+    packages: tuple[str, ...]
+    proves: bool
+
+    @property
+    def installed(self) -> bool:
+        return all(find_spec(module.partition(".")[0]) for module in self.modules)
+
+
+class Words:
+    """A trace as labelled words over the letters "0", "1", …, for learners of DFAs, which tell accepted words from rejected ones.
+
+    The views are numbered. What was done up to a step is a word, accepted where the lowest bit of the view's number is 1. Each
+    further bit is asked for by a letter of its own: what was done, then that letter, is accepted where the bit is 1.
+
+    The smallest DFA has as many states as the smallest Moore machine. From a DFA: the states that the trace visits, each with the
+    bits it answers, are a Moore machine. From a Moore machine: accept by the lowest bit, and let a question lead to any state that
+    accepts or to any that rejects; as soon as there are two views there are both.
+    """
+
+    def __init__(self, trace: Trace) -> None:
+        self.views = list(dict.fromkeys(trace.views))
+        self.actions = {name: str(i) for i, name in enumerate(dict.fromkeys(a.name for a in trace.actions))}
+        bits = max(1, (len(self.views) - 1).bit_length())
+        self.questions = [str(len(self.actions) + i) for i in range(bits - 1)]
+        self._numbers = [self.views.index(view) for view in trace.views]
+        self._done = [self.actions[a.name] for a in trace.actions]
+        self.all_done_by = max(self._done.index(letter) for letter in self.actions.values()) + 2 if self._done else 1
+
+    def __len__(self) -> int:
+        """How many steps the trace has."""
+        return len(self._numbers)
+
+    def at(self, step: int) -> Iterator[tuple[list[str], bool]]:
+        """The words of a step, each with whether it is accepted."""
+        done, number = self._done[:step], self._numbers[step]
+        yield done, bool(number & 1)
+        for i, letter in enumerate(self.questions, 1):
+            yield [*done, letter], bool(number >> i & 1)
+
+    def machine(self, start: Any, follow: Callable[[Any, str], Any], accepts: Callable[[Any], bool]) -> Machine:
+        """The Moore machine that a DFA over these letters is."""
+
+        def shows(state: Any) -> Any:
+            number = sum(accepts(s) << i for i, s in enumerate([state, *(follow(state, letter) for letter in self.questions)]))
+            return self.views[number] if number < len(self.views) else None
+
+        return Machine(start, lambda state, action: follow(state, self.actions[action]), shows)
+
+
+def plain(trace: Trace) -> Machine:
+    """plain.lp in clingo, with more and more states, from as many as there are views: the first machine is the smallest."""
+    import clingo
+
+    views, actions = list(dict.fromkeys(trace.views)), list(dict.fromkeys(a.name for a in trace.actions))
+    facts = [f"view({t},{views.index(view)})." for t, view in enumerate(trace.views)]
+    facts += [f"act({t},{actions.index(action.name)})." for t, action in enumerate(trace.actions)]
+    for k in count(len(views)):
+        control = clingo.Control(["--warn=none", "-c", f"k={k}"])
+        control.load(str(Path(__file__).with_name("plain.lp")))
+        control.add("base", [], "\n".join(facts))
+        control.ground()
+        with control.solve(yield_=True) as handle:
+            if model := handle.model():
+                found = [(atom.name, [x.number for x in atom.arguments]) for atom in model.symbols(shown=True)]
+                break
+    shows = {s: views[v] for name, (s, v, *_) in found if name == "shows"}
+    leads = {(args[0], actions[args[1]]): args[2] for name, args in found if name == "leads"}
+    return Machine(0, lambda state, action: leads[state, action], shows.get)
+
+
+def dfainductor(trace: Trace) -> Machine:
+    """DFA-Inductor: SAT, with more and more states, from as many as there are views: the first DFA is the smallest.
+
+    The trace is given as `Words`. Breadth-first symmetry breaking and no inconsistency graph, as by default. Counterexamples are
+    given by tens, the first ones first, from a start of 100 steps: on long traces that is much faster than all words at once. They
+    are made when asked for, as all words together would have a length of the square of the trace's.
+    """
+    from dfainductor.algorithms.searchers import LSUS
+    from dfainductor.examples import BaseExamplesProvider
+    from dfainductor.structures import APTA, DFA, InconsistencyGraph
+
+    words = Words(trace)
+    if len(words.actions) + len(words.questions) > 10:
+        raise NotApplicableError("more than ten letters, which it reads back in a wrong order")
+
+    class Examples(BaseExamplesProvider):
+        def __init__(self) -> None:
+            pass
+
+        def _written(self, steps: Iterator[int] | range) -> list[str]:
+            return [f"{accepted:d} {len(word)} {' '.join(word)}" for t in steps for word, accepted in words.at(t)]
+
+        def get_init_examples(self) -> list[str]:
+            return self._written(range(min(len(words), max(100, words.all_done_by))))
+
+        def get_counter_examples(self, dfa: DFA) -> list[str]:
+            machine = moore(dfa)
+            state, wrong = machine.start, []
+            for t, step in enumerate(trace):
+                if machine.shows(state) != step.view:
+                    wrong.append(t)
+                if step.action is None or len(wrong) == 10:
+                    break
+                state = machine.follow(state, step.action.name)
+            return self._written(wrong)
+
+        def _init_examples_size(self) -> int:
+            raise NotImplementedError
+
+        _counter_examples_size = _init_examples_size
+
+    def moore(dfa: DFA) -> Machine:
+        return words.machine(dfa.get_start(), lambda state, letter: state.get_child(letter), lambda state: state.is_accepting())
+
+    examples = Examples()
+    apta = APTA(examples.get_init_examples())
+    search = LSUS(apta, InconsistencyGraph(apta, is_empty=True), "cadical153", "BFS", "lin-abs", examples, "none")
+    return moore(search.search(len(words.views), len(words)))
+
+
+def z3gi(trace: Trace) -> Machine:
+    """z3gi: SMT, with more and more states, from as many as there are views: the first DFA is the smallest.
+
+    The trace is given as `Words`, all at once, in the encoding with a node a word and without quantifiers, its fastest here.
+    """
+    import z3
+    from z3gi.encoders import expressive
+    from z3gi.sample import Sample
+
+    words = Words(trace)
+    sys.setrecursionlimit(max(sys.getrecursionlimit(), 10 * len(words)))  # it reads a word letter by letter, each in a call of its own
+    encoder = expressive.Encoder(quantifiers=False)
+    sample = Sample(encoder)
+    for t in range(len(words)):
+        for word, accepted in words.at(t):
+            sample[word] = accepted
+    model = sample.model(z3.Solver(), minstates=len(words.views), maxstates=len(words) + 1)
+
+    @cache
+    def follow(state: int, letter: str) -> int:
+        return model.eval(encoder.trans(state, encoder.alphabet[letter])).as_long()
+
+    @cache
+    def accepts(state: int) -> bool:
+        return bool(model.eval(encoder.out(state)))
+
+    return words.machine(model.eval(encoder.repr(encoder.apt.name)).as_long(), follow, accepts)
+
+
+def rpni(trace: Trace) -> Machine:
+    """AALpy's RPNI: merges states where that is possible, first come first served. The machine explains the trace, but need not be the smallest."""
+    from aalpy.learning_algs import run_RPNI
+
+    done = tuple(action.name for action in trace.actions)
+    return _of_aalpy(run_RPNI([(done[:t], view) for t, view in enumerate(trace.views)], "moore", print_info=False))
+
+
+def gsm(trace: Trace) -> Machine:
+    """AALpy's general state merging, by evidence: the merge that joins most comes first. The machine explains the trace, but need not be the smallest."""
+    from aalpy.learning_algs import run_GSM
+    from aalpy.learning_algs.general_passive.GsmNode import GsmNode
+    from aalpy.learning_algs.general_passive.ScoreFunctionsGSM import EDSM_score, SimpleScoreCalculation
+
+    walk = [trace.views[0], *((action.name, view) for action, view in zip(trace.actions, trace.views[1:], strict=True))]
+    score = SimpleScoreCalculation(GsmNode.deterministic_compatible, EDSM_score())
+    with warnings.catch_warnings(action="ignore"):  # that not all actions were tried in all states
+        return _of_aalpy(run_GSM([walk], score_calc=score, data_format="io_traces"))
+
+
+def _of_aalpy(machine: Any) -> Machine:
+    return Machine(machine.initial_state, lambda state, action: state.transitions[action], lambda state: state.output)
+
+
+PEERS = {
+    "plain.lp": Peer(plain, ("clingo",), ("clingo",), proves=True),
+    "dfainductor": Peer(dfainductor, ("dfainductor.algorithms.searchers",), ("dfainductor", "python-sat"), proves=True),
+    "z3gi": Peer(z3gi, ("z3gi.sample",), ("z3gi", "z3-solver"), proves=True),
+    "RPNI": Peer(rpni, ("aalpy.learning_algs",), ("aalpy",), proves=False),
+    "GSM": Peer(gsm, ("aalpy.learning_algs",), ("aalpy",), proves=False),
+}

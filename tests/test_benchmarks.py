@@ -1,0 +1,157 @@
+"""The benchmarks measure what they say: answers are checked, limits hold, and the README shows a stored run."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+from pathlib import Path
+from typing import Any
+
+import bench
+import plot
+import pytest
+import readme
+import table
+from instances import moore
+from peers import PEERS, Machine, Words
+from suite import SUITE
+
+from ssh_abduction import Theory, Trace, solve
+
+ROOT = Path(__file__).parent.parent
+STORED = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
+ALWAYS = {"instance", "theory", "tool", "seed", "status", "reason"}
+MEASURED = {"images", "true_dstates", "seconds", "cpu", "memory"}
+OURS = {"dstates", "bound", "proven", "prefix", "ground", "solve", "rules", "atoms"}
+
+
+def fewest(trace: Trace) -> int:
+    cost = solve(trace, Theory.causal(), maps=1).cost
+    assert cost
+    return cost.dstates
+
+
+def tiny(seed: int) -> Trace:
+    chance = random.Random(seed)
+    states = chance.randint(1, 4)
+    return moore(states, chance.randint(1, states), steps=chance.randint(0, 14), seed=seed, actions=chance.randint(1, 3)).trace
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_a_peer_explains_the_trace_with_as_few_states_as_it_promises(name: str) -> None:
+    peer = PEERS[name]
+    if not peer.installed:
+        pytest.skip(f"{name} is not installed")
+    for seed in range(12):
+        trace = tiny(seed)
+        states = peer.find(trace).states(trace)
+        assert states is not None, seed
+        assert states == fewest(trace) if peer.proves else states >= fewest(trace), seed
+
+
+def test_the_plain_encoding_agrees_with_the_solver() -> None:
+    for seed in range(100, 140):
+        assert PEERS["plain.lp"].find(tiny(seed)).states(tiny(seed)) == fewest(tiny(seed)), seed
+
+
+def test_a_machine_that_shows_something_else_is_found_out() -> None:
+    trace = Trace.from_steps(["a", "b", "a"], ["travel", "travel"])
+    right = Machine(0, lambda state, _: 1 - state, lambda state: "ab"[state])
+    wrong = Machine(0, lambda state, _: min(state + 1, 1), lambda state: "ab"[state])
+    assert (right.states(trace), wrong.states(trace)) == (2, None)
+
+
+def test_words_ask_for_the_view_bit_by_bit() -> None:
+    words = Words(Trace.from_steps(["a", "b", "c", "b"], ["travel", "right", "travel"]))
+    assert [list(words.at(t)) for t in (0, 2)] == [[([], False), (["2"], False)], [(["0", "1"], False), (["0", "1", "2"], True)]]
+
+
+def test_a_cell_has_all_its_fields() -> None:
+    ours = bench.run("ssh-abduction", SUITE["full aces3"], 0, 5, 4096)
+    assert ours.keys() == ALWAYS | MEASURED | OURS
+    assert (ours["status"], ours["dstates"], ours["proven"], ours["images"], ours["theory"]) == ("ok", 19, True, 23, "full")
+    theirs = bench.run("plain.lp", SUITE["rectangle n=400"], 0, 5, 4096)
+    assert theirs.keys() == ALWAYS | MEASURED | {"dstates", "proven"}
+    assert (theirs["status"], theirs["dstates"], theirs["true_dstates"]) == ("ok", 4, 8)
+
+
+def test_a_cell_ends_at_its_limit() -> None:
+    late = bench.run("plain.lp", SUITE["maze 5x5 n=1600"], 0, 0.5, 4096)
+    assert (late["status"], late["seconds"]) == ("timeout", 0.5)
+    assert 0 < late["cpu"] < 1
+    assert bench.run("plain.lp", SUITE["full aces3"], 0, 0.5, 4096)["status"] == "not applicable"
+
+
+def cell(tool: str, status: str = "ok", seed: int = 0, **fields: Any) -> dict[str, Any]:
+    return {"instance": "x", "tool": tool, "seed": seed, "status": status, "reason": "", "images": 9, **fields}
+
+
+def results(*cells: dict[str, Any]) -> dict[str, Any]:
+    return {"limit": 10, "cells": list(cells)}
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "row"),
+    [
+        ({"seconds": 2}, {"seconds": 5}, "| 4 | 2.0 s | 7 | 5.0 s, 8 MB, ×2.5 |"),
+        ({"seconds": 2}, {"status": "timeout", "seconds": 10, "proven": False}, "| 4 | 2.0 s | 7 | > 10 s, 8 MB, >×5.0 |"),
+        (
+            {"status": "timeout", "seconds": 10, "proven": False, "bound": 3, "dstates": 6},
+            {"status": "timeout", "seconds": 10, "proven": False},
+            "| 3 – 4 | > 10 s | 7 | > 10 s, 8 MB |",
+        ),
+        ({"status": "timeout", "seconds": 10, "proven": False}, {"seconds": 5}, "| 4 | > 10 s | 7 | 5.0 s, 8 MB, <×0.5 |"),
+        ({"seconds": 2}, {"seconds": 1, "proven": False, "dstates": 9}, "| 4 | 2.0 s | 7 | 1.0 s, 8 MB, ×0.5, 9 states |"),
+        ({"seconds": 2}, {"status": "error", "seconds": 1, "reason": "it broke", "proven": False}, "| 4 | 2.0 s | 7 | error¹, 8 MB |"),
+    ],
+)
+def test_a_row_of_the_table(ours: dict[str, Any], theirs: dict[str, Any], row: str) -> None:
+    found = table.times(
+        results(
+            cell("ssh-abduction", **{"memory": 7, "dstates": 4, "proven": True, **ours}),
+            cell("p", **{"memory": 8, "dstates": 4, "proven": True, **theirs}),
+        )
+    )
+    assert row in re.sub(" +", " ", found)
+
+
+def test_many_seeds_show_the_median_and_how_many_were_solved() -> None:
+    seconds = (1, 3, 10)
+    cells = [
+        cell("ssh-abduction", "ok" if s < 10 else "timeout", seed, seconds=s, memory=5, proven=s < 10, dstates=4)
+        for seed, s in enumerate(seconds)
+    ]
+    assert "3.0 s (2 of 3)" in table.times(results(*cells))
+
+
+def test_answers_that_contradict_each_other_are_named() -> None:
+    proven, fewer, bound = cell("a", dstates=4, proven=True), cell("b", dstates=3, proven=False), cell("c", "timeout", bound=5)
+    assert table.contradictions(results(proven, cell("b", dstates=5, proven=False))) == []
+    assert table.contradictions(results(proven, fewer)) == ["x, seed 0: a proved 4 states, b found 3"]
+    assert table.contradictions(results(proven, bound)) == ["x, seed 0: c proved 5 states, a found 4"]
+    assert table.contradictions(results(proven, {**fewer, "seed": 1})) == []
+    assert table.contradictions(results(cell("a", "wrong", reason="no"))) == ["x, seed 0: a: no"]
+
+
+@pytest.mark.parametrize("path", STORED, ids=lambda path: path.name)
+def test_a_stored_run_has_its_fields_and_no_contradiction(path: Path) -> None:
+    run = json.loads(path.read_text())
+    assert run.keys() == {"date", "limit", "memory", "seeds", "machine", "packages", "cells"}
+    assert run["machine"].keys() == {"cpu", "cores", "memory", "system", "python"}
+    for cell in run["cells"]:
+        assert cell.keys() >= ALWAYS
+        assert cell.keys() >= MEASURED or cell["status"] in ("not applicable", "not installed", "error")
+        assert cell["status"] != "ok" or cell.keys() >= {"dstates", "proven"} | (OURS if cell["tool"] == "ssh-abduction" else set())
+    assert table.contradictions(run) == []
+
+
+def test_the_readme_shows_a_stored_run(tmp_path: Path) -> None:
+    text = (ROOT / "README.md").read_text()
+    shown = re.search(r"<!-- bench:begin -->.*\]\((benchmarks/results/.*\.json)\).*<!-- bench:end -->", text, re.DOTALL)
+    assert shown
+    run = json.loads((ROOT / shown[1]).read_text())
+    assert readme.rewritten(text, run, shown[1]) == text
+    picture = tmp_path / "growth.png"
+    plot.draw(run, picture)
+    assert picture.stat().st_size > 10_000
