@@ -34,6 +34,7 @@ from ssh_abduction.trace import Trace
 AT_ONCE = 8000  # steps of a trace that is given whole; the matrix of pairs has the square of that many bytes
 FIRST_PREFIXES = 32  # steps of a prefix that is tried before that
 HELD_BACK = 100  # maps that are kept until all links are given; then they stream
+SPARES = 1  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
 
 
@@ -65,7 +66,7 @@ class NamedEngine(Engine):
         compatible = ~apart[:, self.clique]
         same_view = np.asarray(seen)[:, None] == np.asarray(seen)[self.clique][None, :]
         self._may_be = [[pinned[t]] if t in pinned else row.nonzero()[0].tolist() for t, row in enumerate(compatible & same_view)]
-        self._spares = dict.fromkeys(seen, 1)
+        self._spares = dict.fromkeys(seen, SPARES)
         self._links = dict.fromkeys(range(size - 1))
         if self._speedups.lazy:
             self._links = dict.fromkeys(t for t in [0, *self.clique] if t < size - 1)
