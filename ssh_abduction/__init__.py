@@ -2,6 +2,7 @@
 
 from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
 from ssh_abduction.maps import DState, Path, SSHMap
+from ssh_abduction.online import OnlineMapper
 from ssh_abduction.solver import Bound, Cost, Progress, Search, Solution, Status, solve
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Step, Trace
@@ -12,6 +13,7 @@ __all__ = [
     "Cost",
     "DState",
     "MapError",
+    "OnlineMapper",
     "Path",
     "Progress",
     "SSHError",

@@ -38,6 +38,7 @@ determinism, and that a dstate has one place, course and heading. A theory `with
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -194,7 +195,10 @@ def solve(
 class Search:
     """A stream of the minimal maps of a trace, in constant memory. Iterate once; `solution()` says how it ended.
 
-    Parameters as in `solve`.
+    Parameters as in `solve`, and, to go on when a trace has grown (`online.py`):
+
+    after    a search of this trace's first steps, which has ended: what it grounded and proved is taken over
+    minimal  a map of this trace that costs what `after` proved: it is minimal, and only the others remain to be found
     """
 
     def __init__(
@@ -207,6 +211,8 @@ class Search:
         memory: int | None = None,
         prefixes: bool = True,
         on_progress: Callable[[Progress], None] | None = None,
+        after: Search | None = None,
+        minimal: SSHMap | None = None,
     ) -> None:
         for name, value in (("limit", limit), ("maps", maps), ("memory", memory)):
             if isinstance(value, bool) or not isinstance(value, int | float | None):
@@ -233,7 +239,20 @@ class Search:
         self._whole = not prefixes or bool(self.theory.without)
         self._on_progress = on_progress
         self._watch = _Watch(limit, memory, self._report)
-        self._engine = _Engine(trace, self.theory, self._watch, min(FIRST_PATHS, facts.most_paths(trace, self.theory, len(trace))))
+        self._lower: tuple[int, ...] | None = None  # no map of the trace costs less
+        self._start = len(trace) if self._whole else FIRST_PREFIX
+        if after is None:
+            self._engine = _Engine(trace, self.theory, self._watch, min(FIRST_PATHS, facts.most_paths(trace, self.theory, len(trace))))
+            return
+        self._watch.use_reserve()
+        self._engine = after._engine.over(trace, self._watch)
+        if after.stopped == "interrupted":  # perhaps while a step was grounded
+            self._engine = self._engine.with_paths(self._engine.paths)
+        if not self._whole:
+            self.bound, self._lower = after.bound, after._lower
+            self._start = len(trace) if after.status is Status.OPTIMAL else max(FIRST_PREFIX, self.prefix)
+        if minimal is not None:
+            self.status, self.best, self._cost = Status.OPTIMAL, minimal, after._cost
 
     @property
     def prefix(self) -> int:
@@ -246,7 +265,7 @@ class Search:
         self._begun = True
         self._watch.start()
         try:
-            if self._find_cost():
+            if self.status is Status.OPTIMAL or self._find_cost():
                 for ssh_map in self._minimal_maps():
                     if self._most and self.count == self._most:
                         self.stopped = "maps limit"
@@ -266,7 +285,7 @@ class Search:
         finally:
             self._watch.stop()
         if self.stopped and self.status is not Status.OPTIMAL:
-            if self.best is None and self.stopped == "time limit":
+            if self.best is None and self.stopped == "time limit" and self._watch.has_reserve:
                 self._salvage()
             if self.best is not None and self.status is Status.UNKNOWN:
                 self.status = Status.FEASIBLE
@@ -308,8 +327,7 @@ class Search:
 
     def _find_cost(self) -> bool:
         """Extend the prefix until a minimal map of it replays to the end. False where the prefix has no map."""
-        steps = len(self.trace)
-        size = steps if self._whole else min(steps, FIRST_PREFIX)
+        size = min(len(self.trace), self._start)
         while True:
             self._engine.grow(size)
             minimal = self._minimise()
@@ -317,8 +335,9 @@ class Search:
                 self.status = Status.UNSATISFIABLE
                 return False
             self.partial = minimal.map
-            if self.theory.priorities:
-                self.bound = Bound(**{self.theory.priorities[0]: minimal.cost[0]})
+            if self._lower is None or minimal.cost > self._lower:
+                self._lower = minimal.cost
+                self.bound = Bound(**dict(zip(self.theory.priorities[:1], minimal.cost, strict=False)))
             replayed = self._log.replay(minimal.map.labels)
             if replayed.outcome is Outcome.PREDICTED:
                 self._keep(minimal, replayed.labels)
@@ -336,6 +355,8 @@ class Search:
                 if replayed.outcome is Outcome.PREDICTED and (self.best is None or found.cost < self._cost):
                     self._keep(found, replayed.labels)
                 self._report()
+                if not self._whole and self._lower is not None and found.cost <= self._lower:
+                    break
             if not self._name_paths(minimal.cost if minimal else None):
                 return minimal
 
@@ -344,7 +365,9 @@ class Search:
         needed = self._paths_needed(cost)
         if needed <= self._engine.paths:
             return False
+        size = self.prefix
         self._engine = self._engine.with_paths(needed)
+        self._engine.grow(size)
         return True
 
     def _paths_needed(self, cost: tuple[int, ...] | None) -> int:
@@ -457,6 +480,10 @@ class _Watch:
     def running(self) -> bool:
         return self._started is not None
 
+    @property
+    def has_reserve(self) -> bool:
+        return self._allowed != self._limit
+
     def use_reserve(self) -> None:
         """From now on the whole time limit may be used."""
         self._allowed = self._limit
@@ -505,11 +532,16 @@ class _Engine:
         self._control.add("base", [], facts.theory_facts(theory, paths))
 
     def with_paths(self, paths: int) -> _Engine:
-        """Another control for the same prefix, with more names for paths."""
+        """Another control, still for the empty prefix, with more names for paths."""
         engine = _Engine(self._trace, self._theory, self._watch, paths)
         engine.ground_seconds, engine.solve_seconds = self.ground_seconds, self.solve_seconds
-        engine.grow(self.size)
         return engine
+
+    def over(self, trace: Trace, watch: _Watch) -> _Engine:
+        """This engine, for a longer trace and under other limits."""
+        self._trace, self._watch = trace, watch
+        self.ground_seconds = self.solve_seconds = 0.0
+        return self
 
     def grow(self, size: int) -> None:
         """Let the prefix have `size` steps."""
@@ -563,6 +595,7 @@ class _Engine:
                         break
                     found = _Found(facts.read_map(model, self._trace, self._theory), tuple(model.cost))
                     self.solve_seconds += time.perf_counter() - began
+                    began = math.inf  # if the caller takes no more, nothing is added below
                     yield found
                     began = time.perf_counter()
             finally:

@@ -148,7 +148,7 @@ def test_nothing_preferred_means_all_consistent_maps() -> None:
 
 
 def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
-    trace = wandering(3, rooms=12, length=80, views=2)
+    trace = wandering(3, rooms=16, length=120, views=2)
     solution = solve(trace, Theory.causal(), limit=3)
     assert solution.stopped == "time limit"
     assert solution.status is Status.FEASIBLE
