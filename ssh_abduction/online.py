@@ -21,7 +21,7 @@ contradict the step: actions are deterministic, and a dstate has one observation
 step, and F is the replayed R, by (3). ∎
 
 Else clingo is asked, in the one control that is kept: for all maps of cost c if some map of M predicts the step, else for the minimum,
-and it stops at a map that costs no more than what was proved before. A theory `without` axioms is solved anew, as the claim does not hold.
+which is at least what was proved before. A theory `without` axioms is solved anew, as the claim does not hold.
 
 When time is short
 ------------------

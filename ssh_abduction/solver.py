@@ -32,12 +32,16 @@ where fewest paths come first, once there is any map; where fewest dstates come 
 dstates in the minimal map, as every path holds the two ends of a travel, and a dstate is along one path (with all_on_paths a path may hold one dstate
 alone). Else the control is made again with more names, at most one for each leg of the prefix, which is enough for any map.
 
+*From below.* By (1) the minimum does not fall from prefix to prefix. So a longer prefix is first asked for a map that costs what was
+proved for a shorter one: that is quick where it exists, and then minimal without another proof.
+
 A map of the prefix that stops early is no answer; what its continuations are, the longer prefix says. The claim needs
 determinism, and that a dstate has one place, course and heading. A theory `without` axioms is therefore solved in one go.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 import time
@@ -349,7 +353,7 @@ class Search:
         """A minimal map of the prefix, or None where it has no map. Better maps of the whole trace are kept on the way."""
         while True:
             minimal = None
-            for found in self._engine.improving_maps():
+            for found in self._candidates():
                 minimal = found
                 replayed = self._log.replay(found.map.labels)
                 if replayed.outcome is Outcome.PREDICTED and (self.best is None or found.cost < self._cost):
@@ -359,6 +363,12 @@ class Search:
                     break
             if not self._name_paths(minimal.cost if minimal else None):
                 return minimal
+
+    def _candidates(self) -> Iterator[_Found]:
+        """Maps of the prefix that end with a minimal one: one as cheap as was proved before, or else ever better ones."""
+        if self._lower is not None and not self._whole:
+            yield from itertools.islice(self._engine.maps_of_cost(self._lower), 1)
+        yield from self._engine.improving_maps()
 
     def _name_paths(self, cost: tuple[int, ...] | None) -> bool:
         """Take a control with more names for paths, if the minimal cost found needs them. Says whether it was so."""
@@ -433,6 +443,7 @@ class Search:
         """In the last part of the time limit, look for any map of the whole trace."""
         self._watch.use_reserve()
         self._watch.start()
+        self._lower = None  # a map as cheap as proved is what was not found
         with suppress(_Stopped, KeyboardInterrupt):
             self._engine.grow(len(self.trace))
             self.status = Status.OPTIMAL if self._minimise() else Status.UNSATISFIABLE

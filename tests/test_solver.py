@@ -148,7 +148,7 @@ def test_nothing_preferred_means_all_consistent_maps() -> None:
 
 
 def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
-    trace = wandering(3, rooms=16, length=120, views=2)
+    trace = wandering(3, rooms=20, length=120, views=2)
     solution = solve(trace, Theory.causal(), limit=3)
     assert solution.stopped == "time limit"
     assert solution.status is Status.FEASIBLE
@@ -342,8 +342,10 @@ def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPa
     honest = search._engine.maps_of_cost
 
     def interrupted(cost: tuple[int, ...]) -> Iterator[object]:
-        yield from itertools.islice(honest(cost), 200)
-        raise solver_module._Stopped("interrupted")
+        for number, found in enumerate(honest(cost)):
+            if number == 200:
+                raise solver_module._Stopped("interrupted")
+            yield found
 
     monkeypatch.setattr(search._engine, "maps_of_cost", interrupted)
     maps = tuple(search)
