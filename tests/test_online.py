@@ -74,6 +74,15 @@ def test_circuits_are_replayed(theory: Theory) -> None:
     assert mapper.solution.prefix < 16
 
 
+def test_a_star_seen_from_another_side_is_no_contradiction() -> None:
+    """Spinning where all looks alike: one dstate, whose pattern is seen in every rotation."""
+    stars = [(1, 0, 0, 0), (0, 0, 0, 1), (0, 0, 1, 0), (0, 1, 0, 0)]
+    trace = Trace.from_steps("a" * 20, ["right"] * 19, stars=stars * 5)
+    mapper, answers = follow(trace, Theory(star="pattern"))
+    assert {(a.cost.dstates if a.cost else 0, a.count) for a in answers} == {(1, 1)}
+    assert mapper.searches == 2
+
+
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(st.data())
 def test_sketches_are_consistent(data: st.DataObject) -> None:
