@@ -1,6 +1,6 @@
 # make demo   install what the lock says into .venv, solve a real route and show the map
 # make bench  time and memory on this machine, ours and those of peers from PyPI, as a table; the better part of an hour
-# make parts  times of single parts: circuits, images
+# make parts  times of single parts: circuits, images, and exploring step by step
 # make test   the same, with the tools of development: lint, types, layers, tests
 PYTHON ?= python3
 BIN := .venv/bin
@@ -27,6 +27,7 @@ bench: .venv/bench
 parts: .venv/base
 	$(BIN)/python benchmarks/circuits.py
 	$(BIN)/python benchmarks/images.py
+	$(BIN)/python benchmarks/online.py
 
 lock: .venv/dev
 	$(BIN)/python -m uv pip compile --upgrade --universal --no-header --no-annotate --extra dev --extra bench --python-version 3.11 -o requirements.lock pyproject.toml

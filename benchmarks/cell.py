@@ -24,7 +24,8 @@ from table import OURS
 
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.checker import check
-from ssh_abduction.solver import Status, peak_memory
+from ssh_abduction.engine import peak_memory
+from ssh_abduction.solver import Status
 
 AROUND = 300  # seconds for all that the clock does not count
 MARGIN = 0.1  # how much later than its own limit a solver of ours is ended: time to hand over what it has

@@ -3,6 +3,7 @@
 from ssh_abduction.apart import Certificate
 from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
 from ssh_abduction.maps import DState, Path, SSHMap
+from ssh_abduction.online import OnlineMapper
 from ssh_abduction.solver import Bound, Cost, Progress, Search, Solution, Status, solve
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
@@ -15,6 +16,7 @@ __all__ = [
     "Cost",
     "DState",
     "MapError",
+    "OnlineMapper",
     "Path",
     "Progress",
     "SSHError",

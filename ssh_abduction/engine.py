@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -12,6 +13,7 @@ import clingo
 
 from ssh_abduction import encodings, facts
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.replay import Log
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
@@ -59,6 +61,10 @@ class Watch:
 
     def start(self) -> None:
         self._started = time.perf_counter()
+
+    @property
+    def has_reserve(self) -> bool:
+        return self._allowed != self._limit
 
     @property
     def running(self) -> bool:
@@ -125,7 +131,11 @@ class Engine:
         return min(len(self._trace), max(failed + 1, int(self.size * GROWTH)))
 
     def with_paths(self, paths: int) -> Engine:
-        """Another engine for the same prefix, with more names for paths."""
+        """Another engine, still for the empty prefix, with so many names for paths."""
+        raise NotImplementedError
+
+    def over(self, trace: Trace, watch: Watch, log: Log) -> Engine:
+        """An engine for a trace that this one's has grown to, under other limits."""
         raise NotImplementedError
 
     def improving_maps(self) -> Iterator[Found]:
@@ -170,6 +180,7 @@ class Engine:
                         return bool(result.exhausted)
                     answer = read(model)
                     self.solve_seconds += time.perf_counter() - began
+                    began = math.inf  # if the caller takes no more, nothing is added below
                     yield answer
                     began = time.perf_counter()
             finally:
@@ -190,8 +201,12 @@ class StepEngine(Engine):
     def with_paths(self, paths: int) -> StepEngine:
         engine = StepEngine(self._trace, self._theory, self._watch, paths)
         engine.ground_seconds, engine.solve_seconds = self.ground_seconds, self.solve_seconds
-        engine.grow(self.size)
         return engine
+
+    def over(self, trace: Trace, watch: Watch, log: Log) -> StepEngine:
+        self._trace, self._watch = trace, watch
+        self.ground_seconds = self.solve_seconds = 0.0
+        return self
 
     def grow(self, size: int) -> None:
         began = time.perf_counter()

@@ -12,7 +12,6 @@ from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Trace
 
 _COURSE = {"pos": 1, "neg": -1}
-BEYOND = Function("beyond")  # assumed by who asks for a map with dstates that have no name
 
 
 def encoding_names(theory: Theory) -> tuple[str, ...]:
@@ -164,6 +163,11 @@ def batch_facts(batch: int, steps: Iterable[tuple[int, int, Sequence[int], int |
         facts += [f"follows({before},{t})."] if before is not None and len(names) > 1 else []
     facts += [f"link({batch},{t},{action})." for t, action in links]
     return "\n".join(facts)
+
+
+def resting(batch: int) -> Symbol:
+    """The atom that holds if a step of the batches up to this one is at the rest of its view. Assumed by who asks for such a map."""
+    return Function("resting", [Number(batch)])
 
 
 def read_names(model: Model) -> dict[int, int]:

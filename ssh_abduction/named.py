@@ -47,6 +47,12 @@ class NamedEngine(Engine):
         self._speedups = speedups
         self.clique: list[int] = []
 
+    def with_paths(self, paths: int) -> NamedEngine:
+        return NamedEngine(self._trace, self._theory, self._watch, self._log, self._speedups)
+
+    def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
+        return NamedEngine(trace, self._theory, watch, log, self._speedups)
+
     def next_size(self, failed: int) -> int:
         steps = len(self._trace)
         if self.size < FIRST_PREFIXES:
@@ -103,9 +109,11 @@ class NamedEngine(Engine):
             yield self._found((0,))
             return
         spares = cost[0] - len(self.clique)
-        beyond = [(facts.BEYOND, True)]
+        if spares < 0:
+            return
         while True:  # until no map of this cost needs a rest
-            answer = next(self._answers(facts.read_names, f"enum,{spares},{spares}", 1, assumptions=beyond), None)
+            resting = [(facts.resting(self._batches - 1), True)]
+            answer = next(self._answers(facts.read_names, f"enum,{spares},{spares}", 1, assumptions=resting), None)
             if answer is None or not self._widened(answer):
                 break
         while True:

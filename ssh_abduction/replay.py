@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from ssh_abduction.theory import Theory
-from ssh_abduction.trace import Trace
+from ssh_abduction.trace import Step, Trace
 
 
 class Outcome(Enum):
@@ -31,19 +31,29 @@ class Replay:
     outcome: Outcome
 
 
+def observation(step: Step, theory: Theory) -> tuple[object, object]:
+    """What the axioms read at a step: the view, with the star where the theory uses stars, in one rotation of four if any will do.
+
+    By functional_view and the axioms of the stars, a dstate has one observation.
+    """
+    star = step.openings if theory.star in ("pattern", "frame") else None
+    if star is None or theory.star == "frame":
+        return step.view, star
+    return step.view, min(star[k:] + star[:k] for k in range(4))
+
+
 class Log:
     """A trace as integers, made once and replayed over many maps.
 
     actions   which action was done at each step
-    seen      which observation was made: the view, with the star where the theory uses stars
+    seen      which observation was made
     """
 
     def __init__(self, trace: Trace, theory: Theory) -> None:
-        with_star = theory.star in ("pattern", "frame")
         actions: dict[str, int] = {}
         seen: dict[object, int] = {}
         self.actions = [actions.setdefault(a.name, len(actions)) for a in trace.actions]
-        self.seen = [seen.setdefault((step.view, step.openings if with_star else None), len(seen)) for step in trace.steps]
+        self.seen = [seen.setdefault(observation(step, theory), len(seen)) for step in trace.steps]
 
     def replay(self, labels: Sequence[int], known: int | None = None) -> Replay:
         """Replay the trace over the map that `labels` make of its first steps; `known` of them make links (default all)."""

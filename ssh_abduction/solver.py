@@ -32,12 +32,16 @@ where fewest paths come first, once there is any map; where fewest dstates come 
 dstates in the minimal map, as every path holds the two ends of a travel, and a dstate is along one path (with all_on_paths a path may hold one dstate
 alone). Else the control is made again with more names, at most one for each leg of the prefix, which is enough for any map.
 
+*From below.* By (1) the minimum does not fall from prefix to prefix. So a longer prefix is first asked for a map that costs what was
+proved for a shorter one: that is quick where it exists, and then minimal without another proof.
+
 A map of the prefix that stops early is no answer; what its continuations are, the longer prefix says. The claim needs
 determinism, and that a dstate has one place, course and heading. A theory `without` axioms is therefore solved in one go.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -192,7 +196,10 @@ def solve(
 class Search:
     """A stream of the minimal maps of a trace, in constant memory. Iterate once; `solution()` says how it ended.
 
-    Parameters as in `solve`.
+    Parameters as in `solve`, and, to go on when a trace has grown (`online.py`):
+
+    after    a search of this trace's first steps, which has ended: what it grounded and proved is taken over
+    minimal  a map of this trace that costs what `after` proved: it is minimal, and only the others remain to be found
     """
 
     def __init__(
@@ -205,6 +212,8 @@ class Search:
         memory: int | None = None,
         speedups: Speedups = ALL,
         on_progress: Callable[[Progress], None] | None = None,
+        after: Search | None = None,
+        minimal: SSHMap | None = None,
     ) -> None:
         for name, value in (("limit", limit), ("maps", maps), ("memory", memory)):
             if isinstance(value, bool) or not isinstance(value, int | float | None):
@@ -232,7 +241,20 @@ class Search:
         self._speedups = speedups
         self._on_progress = on_progress
         self._watch = Watch(limit, memory, self._report)
-        self._engine = self._new_engine()
+        self._lower: tuple[int, ...] | None = None  # no map of the trace costs less
+        self._start = len(trace) if self._whole else FIRST_PREFIX
+        if after is None:
+            self._engine = self._new_engine()
+            return
+        self._watch.use_reserve()
+        self._engine = after._engine.over(trace, self._watch, self._log)
+        if after.stopped == "interrupted":  # perhaps while a step was grounded
+            self._engine = self._engine.with_paths(self._engine.paths)
+        if not self._whole:
+            self.bound, self._lower = after.bound, after._lower
+            self._start = len(trace) if after.status is Status.OPTIMAL else max(FIRST_PREFIX, self.prefix)
+        if minimal is not None:
+            self.status, self.best, self._cost = Status.OPTIMAL, minimal, after._cost
 
     def _new_engine(self) -> Engine:
         theory = self.theory
@@ -252,8 +274,11 @@ class Search:
         self._begun = True
         self._watch.start()
         try:
-            self._merge()
-            if self._find_cost():
+            if self.status is not Status.OPTIMAL:
+                self._merge()
+            elif not self.prefix:
+                self._engine.grow(min(len(self.trace), FIRST_PREFIX))
+            if self.status is Status.OPTIMAL or self._find_cost():
                 for ssh_map in self._minimal_maps():
                     if self._most and self.count == self._most:
                         self.stopped = "maps limit"
@@ -274,7 +299,7 @@ class Search:
             self._watch.stop()
         self._raise_bound(self._engine.bound)
         if self.stopped and self.status is not Status.OPTIMAL:
-            if self.best is None and self.stopped == "time limit":
+            if self.best is None and self.stopped == "time limit" and self._watch.has_reserve:
                 self._salvage()
             if self.best is not None and self.status is Status.UNKNOWN:
                 self.status = Status.FEASIBLE
@@ -330,8 +355,7 @@ class Search:
 
     def _find_cost(self) -> bool:
         """Extend the prefix until a minimal map of it replays to the end. False where the prefix has no map."""
-        steps = len(self.trace)
-        size = steps if self._whole else min(steps, FIRST_PREFIX)
+        size = min(len(self.trace), self._start)
         while True:
             self._engine.grow(size)
             minimal = self._minimise()
@@ -340,6 +364,8 @@ class Search:
                 return False
             self.partial = minimal.map
             self._raise_bound(minimal.cost[0] if minimal.cost else None)
+            if self._lower is None or minimal.cost > self._lower:
+                self._lower = minimal.cost
             replayed = self._log.replay(minimal.map.labels)
             if replayed.outcome is Outcome.PREDICTED:
                 self._keep(minimal, replayed.labels)
@@ -363,21 +389,31 @@ class Search:
         """A minimal map of the prefix, or None where it has no map. Better maps of the whole trace are kept on the way."""
         while True:
             minimal = None
-            for found in self._engine.improving_maps():
+            for found in self._candidates():
                 minimal = found
                 replayed = self._log.replay(found.map.labels)
                 if replayed.outcome is Outcome.PREDICTED and (self.best is None or found.cost < self._cost):
                     self._keep(found, replayed.labels)
                 self._report()
+                if not self._whole and self._lower is not None and found.cost <= self._lower:
+                    break
             if not self._name_paths(minimal.cost if minimal else None):
                 return minimal
+
+    def _candidates(self) -> Iterator[Found]:
+        """Maps of the prefix that end with a minimal one: one as cheap as was proved before, or else ever better ones."""
+        if self._lower is not None and not self._whole and self._speedups.from_below and isinstance(self._engine, StepEngine):
+            yield from itertools.islice(self._engine.maps_of_cost(self._lower, 1), 1)
+        yield from self._engine.improving_maps()
 
     def _name_paths(self, cost: tuple[int, ...] | None) -> bool:
         """Take a control with more names for paths, if the minimal cost found needs them. Says whether it was so."""
         needed = self._paths_needed(cost)
         if needed <= self._engine.paths:
             return False
+        size = self.prefix
         self._engine = self._engine.with_paths(needed)
+        self._engine.grow(size)
         return True
 
     def _paths_needed(self, cost: tuple[int, ...] | None) -> int:
@@ -439,6 +475,7 @@ class Search:
         """In the last part of the time limit, look for any map of the whole trace."""
         self._watch.use_reserve()
         self._watch.start()
+        self._lower = None  # a map as cheap as proved is what was not found
         with suppress(Stopped, KeyboardInterrupt):
             self._engine.grow(len(self.trace))
             self.status = Status.OPTIMAL if self._minimise() else Status.UNSATISFIABLE

@@ -14,6 +14,7 @@ class Speedups:
 
     prefixes     solve for a prefix, replay its maps, and extend it where they fail
     path_names   begin with few names for paths
+    from_below   ask a longer prefix first for a map that costs what was proved for a shorter one
     names        causal theory: give the dstates names beforehand
     clique       with names: pin steps that are pairwise apart
     lazy         with names: give clingo only the links that replaying contradicts
@@ -23,6 +24,7 @@ class Speedups:
 
     prefixes: bool = True
     path_names: bool = True
+    from_below: bool = True
     names: bool = True
     clique: bool = True
     lazy: bool = True

@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeAlias
 
 from ssh_abduction import encodings
 from ssh_abduction.errors import TheoryError, TraceError, brief
-from ssh_abduction.trace import Trace
+from ssh_abduction.trace import Step, Trace
 
 Count: TypeAlias = Literal["dstates", "paths", "places", "excuses"]
 
@@ -128,28 +128,33 @@ class Theory:
         Raises TraceError where a view, the kind of an action, or a star is missing, TheoryError where stars are asked for but
         the trace has none.
         """
-        for i, step in enumerate(trace.steps):
-            if step.view is None:
-                raise TraceError(f"{trace.at(i)}: view: expected one, got only an image; cluster the images into views first")
-            if self.level == "topological" and step.action is not None and step.action.kind is None:
-                raise TraceError(
-                    f'{trace.at(i)}: action.kind: expected "travel" or "turn" in a topological theory, got none for {brief(step.action.name)}; '
-                    f'write {{"name": …, "kind": "travel"}}, or take --theory causal'
-                )
         star = self.star
         if star == "auto":
             star = "frame" if trace.has_stars else "none"
-        if star != "none":
-            if not trace.has_stars:
-                raise TheoryError(f"star: expected a trace with stars for star={star}, got none; add them to the steps, or take star=none")
-            for i, step in enumerate(trace.steps):
-                if step.star is None:
-                    raise TraceError(f"{trace.at(i)}: star: expected one, as other steps have stars; add it, or take star=none")
-                try:
-                    _ = step.openings
-                except TraceError as error:
-                    raise TraceError(f"{trace.at(i)}: {error}, or take star=none") from None
-        return replace(self, star=star)
+        if star != "none" and not trace.has_stars:
+            raise TheoryError(f"star: expected a trace with stars for star={star}, got none; add them to the steps, or take star=none")
+        theory = replace(self, star=star)
+        for i, step in enumerate(trace.steps):
+            theory.require(step, trace.at(i))
+        return theory
+
+    def require(self, step: Step, where: str) -> None:
+        """Raises TraceError, which says where, if a step lacks what the axioms need. Star has to be settled."""
+        if step.view is None:
+            raise TraceError(f"{where}: view: expected one, got only an image; cluster the images into views first")
+        if self.level == "topological" and step.action is not None and step.action.kind is None:
+            raise TraceError(
+                f'{where}: action.kind: expected "travel" or "turn" in a topological theory, got none for {brief(step.action.name)}; '
+                f'write {{"name": …, "kind": "travel"}}, or take --theory causal'
+            )
+        if self.star == "none":
+            return
+        if step.star is None:
+            raise TraceError(f"{where}: star: expected one, as other steps have stars; add it, or take star=none")
+        try:
+            _ = step.openings
+        except TraceError as error:
+            raise TraceError(f"{where}: {error}, or take star=none") from None
 
     def to_dict(self) -> dict[str, Any]:
         """The theory as plain data."""

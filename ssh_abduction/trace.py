@@ -104,6 +104,11 @@ class Step:
         if self.view is not None:
             _view(self.view, "view")
 
+    @staticmethod
+    def of(view: View, star: Sequence[float] | None = None, where: str = "step", action: Action | None = None) -> Step:
+        """A step from a view and perhaps a star. Raises TraceError that says where."""
+        return Step(_view(view, f"{where}: view"), action, None if star is None else _star(list(star), f"{where}: star"))
+
     @property
     def openings(self) -> Openings | None:
         """The star as (ahead, right, back, left). Bearings go to the nearest quarter; TraceError where two share one."""
@@ -210,12 +215,8 @@ class Trace:
         if len(openings) != len(seen):
             raise TraceError(f"trace: expected a star a view, got {len(openings)} stars and {len(seen)} views")
         steps = tuple(
-            Step(
-                view=_view(view, f"step {i}: view"),
-                action=done[i] if i < len(done) else None,
-                star=None if openings[i] is None else _star(list(openings[i] or ()), f"step {i}: star"),
-            )
-            for i, view in enumerate(seen)
+            Step.of(view, star, f"step {i}", done[i] if i < len(done) else None)
+            for i, (view, star) in enumerate(zip(seen, openings, strict=True))
         )
         return cls(steps, name=name)
 

@@ -55,7 +55,7 @@ def test_docstrings_run() -> None:
     import importlib
 
     attempted = 0
-    for name in ("trace", "theory", "solver", "explain", "checker", "maps", "replay"):
+    for name in ("trace", "theory", "solver", "explain", "checker", "maps", "replay", "sketch", "online"):
         result = doctest.testmod(importlib.import_module(f"ssh_abduction.{name}"))
         assert result.failed == 0
         attempted += result.attempted

@@ -350,8 +350,10 @@ def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPa
     honest = search._engine.maps_of_cost
 
     def interrupted(cost: tuple[int, ...], enough: int) -> Iterator[object]:
-        yield from itertools.islice(honest(cost, enough), 200)
-        raise solver_module.Stopped("interrupted")
+        for number, found in enumerate(honest(cost, enough)):
+            if number == 200:
+                raise solver_module.Stopped("interrupted")
+            yield found
 
     monkeypatch.setattr(search._engine, "maps_of_cost", interrupted)
     maps = tuple(search)

@@ -1,0 +1,185 @@
+"""The mapper that follows a robot: equal to solving anew after every step, quick, and never without a map."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import theories, traces
+from worlds import TOURS, drive, rectangle
+
+from ssh_abduction import Action, OnlineMapper, Solution, Status, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction.checker import check
+from ssh_abduction.sketch import Sketch
+
+NO_TIME = 1e-9  # seconds: every search is stopped before it begins
+
+
+def follow(trace: Trace, theory: Theory, limit: float | None = None, maps: int = 0) -> tuple[OnlineMapper, list[Solution]]:
+    """The mapper at the end of a trace, and its answers after each step."""
+    first, *rest = trace.steps
+    mapper = OnlineMapper(first.view or "", theory, star=first.star, limit=limit, maps=maps)
+    answers = [mapper.solution]
+    for action, step in zip(trace.actions, rest, strict=True):
+        answers.append(mapper.observe(action, step.view or "", star=step.star))
+    return mapper, answers
+
+
+def agree(trace: Trace, theory: Theory) -> None:
+    """After every step the answer is what solving the prefix anew gives."""
+    theory = theory.resolve(trace)
+    _, answers = follow(trace, theory)
+    for i, answer in enumerate(answers):
+        anew = solve(trace.prefix(i + 1), theory, maps=0)
+        assert (answer.status, answer.complete, answer.steps) == (anew.status, True, i + 1)
+        assert answer.bound == anew.bound or not anew.maps
+        assert set(answer.maps) == set(anew.maps)
+        assert answer.count == anew.count
+        for name in theory.priorities if anew.cost else ():
+            assert getattr(answer.cost, name) == getattr(anew.cost, name)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.data())
+def test_after_every_step_the_answer_is_that_of_solving_anew(data: st.DataObject) -> None:
+    trace = data.draw(traces(max_steps=9), label="trace")
+    agree(trace, data.draw(theories(trace), label="theory"))
+
+
+@pytest.mark.parametrize("name", ["deterministic", "one_place", "travel_leaves"])
+def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
+    agree(Trace.from_steps("abaabb", ["travel", "around", "travel", "right", "travel"]), Theory(without=(name,)))
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.data())
+def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
+    trace = data.draw(traces(), label="trace")
+    theory = data.draw(theories(trace), label="theory").resolve(trace)
+    _, answers = follow(trace, theory, maps=2)
+    for i, answer in enumerate(answers):
+        anew = solve(trace.prefix(i + 1), theory, maps=0)
+        assert answer.status is anew.status
+        assert answer.count == min(2, anew.count)
+        assert set(answer.maps) <= set(anew.maps)
+        assert not answer.complete or answer.count == anew.count
+
+
+@pytest.mark.parametrize("theory", [Theory.causal(), Theory.topological(), Theory.circumscriptive()], ids=["causal", "dstates", "paths"])
+def test_circuits_are_replayed(theory: Theory) -> None:
+    mapper, answers = follow(rectangle(2000), theory)
+    assert answers[-1].maps == solve(rectangle(2000), theory).maps
+    assert all(a.status is Status.OPTIMAL and a.complete for a in answers)
+    assert mapper.searches < 12
+    assert mapper.solution.prefix < 16
+
+
+def test_a_star_seen_from_another_side_is_no_contradiction() -> None:
+    """Spinning where all looks alike: one dstate, whose pattern is seen in every rotation."""
+    stars = [(1, 0, 0, 0), (0, 0, 0, 1), (0, 0, 1, 0), (0, 1, 0, 0)]
+    trace = Trace.from_steps("a" * 20, ["right"] * 19, stars=stars * 5)
+    mapper, answers = follow(trace, Theory(star="pattern"))
+    assert {(a.cost.dstates if a.cost else 0, a.count) for a in answers} == {(1, 1)}
+    assert mapper.searches == 2
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(st.data())
+def test_sketches_are_consistent(data: st.DataObject) -> None:
+    trace = data.draw(traces(max_steps=14), label="trace")
+    theory = data.draw(theories(trace), label="theory").resolve(trace)
+    sketch = Sketch(trace.steps[0], theory, homing=data.draw(st.booleans(), label="homing"))
+    for i, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True)):
+        assert check(trace.prefix(i + 1), sketch.map(), theory) == ()
+        if not sketch.extend(action, step):
+            return
+    assert check(trace, sketch.map(), theory) == ()
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(st.data())
+def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) -> None:
+    trace = data.draw(traces(max_steps=9), label="trace")
+    theory = data.draw(theories(trace), label="theory").resolve(trace)
+    mapper, answers = follow(trace, theory, limit=NO_TIME)
+    for i, answer in enumerate(answers):
+        assert answer.status in (Status.FEASIBLE, Status.UNKNOWN)
+        assert (answer.complete, answer.stopped, answer.count) == (False, "time limit", answer.status is Status.FEASIBLE)
+        for ssh_map in answer.maps:
+            assert check(trace.prefix(i + 1), ssh_map, theory) == ()
+    mapper._limit, mapper._next_search = None, 0
+    action = trace.actions[0] if len(trace) > 1 else Action("travel", "travel")
+    star = trace.steps[-1].star
+    answer = mapper.observe(action, "a", star=star)
+    anew = solve(mapper.trace, theory, maps=0)
+    assert (answer.status, answer.complete, set(answer.maps)) == (anew.status, True, set(anew.maps))
+
+
+def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
+    """The tour is solved for its first half; then there is no time."""
+    trace = drive(*TOURS["comb"])
+    theory = Theory.topological().resolve(trace)
+    half = len(trace) // 2
+    mapper, _ = follow(trace.prefix(half), theory)
+    mapper._limit = NO_TIME
+    bound = 0
+    for i in range(half, len(trace)):
+        answer = mapper.observe(trace.actions[i - 1], trace.steps[i].view or "", star=trace.steps[i].star)
+        best = solve(trace.prefix(i + 1), theory).cost
+        assert best is not None
+        assert answer.cost is not None
+        assert answer.bound.dstates is not None
+        assert bound <= answer.bound.dstates <= best.dstates <= answer.cost.dstates
+        assert check(trace.prefix(i + 1), answer.maps[0], theory) == ()
+        assert answer.status is Status.FEASIBLE or (answer.status is Status.OPTIMAL and best == answer.cost)
+        bound = answer.bound.dstates
+    assert mapper.solution.status is Status.FEASIBLE
+    assert mapper.searches <= half + 5  # not one a step
+
+
+def test_what_cannot_be_leaves_no_map() -> None:
+    mapper = OnlineMapper("a", star=[1, 0, 0, 0], limit=None)
+    assert mapper.observe("around", "b", star=[0, 0, 1, 0]).status is Status.OPTIMAL
+    for view in ("a", "c", "a"):
+        solution = mapper.observe("around", view, star=[1, 0, 0, 0])
+    assert (solution.status, solution.maps, solution.cost, solution.complete) == (Status.UNSATISFIABLE, (), None, True)
+    assert solution.steps == 5
+
+
+@pytest.mark.parametrize(
+    ("action", "view", "star", "message"),
+    [
+        ("jump", "a", [1, 0, 0, 0], r"step 1: action\.kind: expected"),
+        ({"name": "travel", "kind": "turn", "turn": "left"}, "a", [1, 0, 0, 0], "step 1: action: 'travel' has kind turn"),
+        ({"name": "travel", "kind": "walk"}, "a", [1, 0, 0, 0], r"action\.kind: expected"),
+        ("travel", "a", None, "step 2: star: expected one"),
+        ("travel", "a", [0, 10], "step 2: star: expected bearings"),
+        ("travel", "a", "1000", "step 2: star"),
+        ("travel", None, [1, 0, 0, 0], "step 2: view: expected"),
+    ],
+)
+def test_a_step_that_does_not_fit_changes_nothing(action: object, view: object, star: object, message: str) -> None:
+    mapper, other = (follow(Trace.from_steps("ab", ["travel"], stars=[(1, 0, 0, 0)] * 2), Theory())[0] for _ in range(2))
+    before, searches = mapper.solution, mapper.searches
+    with pytest.raises(TraceError, match=message):
+        mapper.observe(action, view, star=star)  # type: ignore[arg-type]
+    assert (mapper.solution, mapper.trace, mapper.searches) == (before, other.trace, searches)
+    again, expected = (m.observe("around", "b", star=[0, 0, 1, 0]) for m in (mapper, other))
+    assert (again.maps, again.status, again.bound) == (expected.maps, expected.status, expected.bound)
+
+
+def test_the_first_step_settles_the_stars() -> None:
+    assert OnlineMapper("a", star=[1, 0, 0, 0]).theory.star == "frame"
+    plain = OnlineMapper("a")
+    assert plain.theory.star == "none"
+    with pytest.raises(TraceError, match="step 1: star: expected none, as the first step has none"):
+        plain.observe("travel", "b", star=[1, 0, 0, 0])
+    with pytest.raises(TheoryError, match="star: expected a trace with stars"):
+        OnlineMapper("a", Theory(star="pattern"))
+    assert OnlineMapper("a", Theory(star="none")).observe("travel", "b", star=[1, 0, 0, 0]).count == 1
+
+
+def test_the_same_steps_give_the_same_answers() -> None:
+    trace = drive(*TOURS["comb"], stars=False)
+    first, second = ([(a.maps, a.cost, a.prefix) for a in follow(trace, Theory())[1]] for _ in range(2))
+    assert first == second
