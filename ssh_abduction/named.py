@@ -34,7 +34,7 @@ from ssh_abduction.trace import Trace
 AT_ONCE = 8000  # steps of a trace that is given whole; the matrix of pairs has the square of that many bytes
 FIRST_PREFIXES = 32  # steps of a prefix that is tried before that
 HELD_BACK = 100  # maps that are kept until all links are given; then they stream
-SPARES = 1  # spare names of a view, to begin with
+SPARES = 3  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
 
 
@@ -111,11 +111,9 @@ class NamedEngine(Engine):
         spares = cost[0] - len(self.clique)
         if spares < 0:
             return
-        while True:  # until no map of this cost needs a rest
-            resting = [(facts.resting(self._batches - 1), True)]
-            answer = next(self._answers(facts.read_names, f"enum,{spares},{spares}", 1, assumptions=resting), None)
-            if answer is None or not self._widened(answer):
-                break
+        if not enough:
+            while self._needs_rest(spares):
+                pass
         while True:
             held: list[Found] = []
             failed: Iterable[int] = ()
@@ -125,15 +123,26 @@ class NamedEngine(Engine):
                 if failed:
                     break
                 held.append(self._found(labels))
-                if not lazy:
+                if enough:
+                    if len(held) == enough:
+                        yield from held
+                        return
+                elif not lazy:
                     yield held.pop()
-                elif len(held) == (enough or HELD_BACK):
-                    failed = () if enough else range(self.size - 1)
+                elif len(held) == HELD_BACK:
+                    failed = range(self.size - 1)
                     break
-            if not failed:
+            if failed:
+                self._add(failed)
+            elif not enough or not self._needs_rest(spares):
                 yield from held
                 return
-            self._add(failed)
+
+    def _needs_rest(self, spares: int) -> bool:
+        """Take more spare names, if some answer of this cost uses a rest. Says whether it was so."""
+        resting = [(facts.resting(self._batches - 1), True)]
+        answer = next(self._answers(facts.read_names, f"enum,{spares},{spares}", 1, assumptions=resting), None)
+        return answer is not None and self._widened(answer)
 
     def _raise_bound(self, costs: Sequence[int]) -> None:
         self.bound = max(self.bound or 0, len(self.clique) + costs[0])
