@@ -2,6 +2,8 @@
 
     python benchmarks/cell.py TOOL INSTANCE SEED SECONDS MIB
 
+TOOL is a peer, ssh-abduction, or "ssh-abduction without" and the names of speed-ups, commas between.
+
 The process is ended by a signal when its time is over. The clock does not run while programs are loaded, the trace is made, or the
 answer is checked: a map by the checker, a peer's machine by running it along the trace.
 """
@@ -19,10 +21,10 @@ import time
 from typing import Any
 
 from peers import PEERS, Machine, NotApplicableError
-from suite import SUITE
-from table import OURS
+from suite import SUITE, full_maze
+from table import OURS, WITHOUT
 
-from ssh_abduction import Solution, Theory, Trace, solve
+from ssh_abduction import Solution, Speedups, Theory, Trace, solve
 from ssh_abduction.checker import check
 from ssh_abduction.engine import peak_memory
 from ssh_abduction.solver import Status
@@ -34,7 +36,7 @@ SHARE = 0.8  # of the memory is its own limit, for the same reason
 
 def main() -> None:
     tool, name, seed, seconds, memory = sys.argv[1:]
-    instance, limit, space = SUITE[name], float(seconds), int(memory)
+    instance, limit, space = (SUITE | {full_maze.name: full_maze})[name], float(seconds), int(memory)
     end_after(AROUND)
     for module in PEERS[tool].modules if tool in PEERS else ():
         importlib.import_module(module)
@@ -48,9 +50,10 @@ def main() -> None:
     outcome: dict[str, Any] = {}
     try:
         with contextlib.redirect_stdout(io.StringIO()):
-            if tool == OURS:
+            if tool.startswith(OURS):
                 end_after(limit * (1 + MARGIN) + 1)
-                answer = solve(trace, theory, limit=limit, memory=int(SHARE * space), maps=1)
+                speedups = Speedups.without(tool.removeprefix(OURS).removeprefix(WITHOUT))
+                answer = solve(trace, theory, limit=limit, memory=int(SHARE * space), maps=1, speedups=speedups)
             else:
                 end_after(limit)
                 answer = PEERS[tool].find(trace)
@@ -62,7 +65,7 @@ def main() -> None:
     spent = {"seconds": time.perf_counter() - began, "cpu": time.process_time() - cpu, "memory": peak_memory()}
     end_after(AROUND)
     if not outcome:
-        outcome = of_solution(answer, trace, theory) if tool == OURS else of_machine(answer, trace, PEERS[tool].proves)
+        outcome = of_solution(answer, trace, theory) if tool.startswith(OURS) else of_machine(answer, trace, PEERS[tool].proves)
     if outcome["status"] == "ok" and spent["seconds"] > limit:
         outcome["status"] = "timeout"
     say(**outcome, **{name: round(value, 5) for name, value in spent.items()})

@@ -1,6 +1,6 @@
-"""Writes the table of a stored run into the README.
+"""Writes the table of a stored run into the README, or into another page.
 
-    python benchmarks/readme.py RESULTS.json
+    python benchmarks/readme.py RESULTS.json [PAGE]
 
 It stands between two comments that mark it; what is around them stays.
 """
@@ -26,7 +26,7 @@ def block(results: dict[str, Any], source: str) -> str:
     return (
         f"{times(results)}\n\n"
         f"{results['date']}, {machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, {versions}; "
-        f"{results['limit']:g} s and {results['memory']:,} MiB a cell, {seeds}. From [`{source}`]({source}).\n"
+        f"{results['limit']:g} s and {results['memory']:,} MiB a cell, {seeds}. From `{source}`.\n"
     )
 
 
@@ -37,7 +37,7 @@ def rewritten(readme: str, results: dict[str, Any], source: str) -> str:
 
 def main() -> None:
     path = Path(sys.argv[1]).resolve()
-    readme = ROOT / "README.md"
+    readme = Path(sys.argv[2]) if len(sys.argv) > 2 else ROOT / "README.md"
     results = json.loads(path.read_text(encoding="utf-8"))
     readme.write_text(rewritten(readme.read_text(encoding="utf-8"), results, path.relative_to(ROOT).as_posix()), encoding="utf-8")
 

@@ -71,6 +71,7 @@ def _maze(side: int, steps: int, *, full: bool = False) -> Instance:
     return Instance(f"{'full ' if full else ''}maze {side}x{side} n={steps}", lambda seed: walk(seed=seed))
 
 
+full_maze = _maze(2, 60, full=True)  # what the plain encoding can still do
 SUITE = {
     instance.name: instance
     for instance in (

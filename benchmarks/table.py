@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 OURS = "ssh-abduction"
+WITHOUT = " without "  # between that and the speed-ups that are off
 MARKS = "¹²³⁴⁵⁶⁷⁸⁹"
 
 Cells: TypeAlias = Sequence[dict[str, Any]]

@@ -54,6 +54,7 @@ from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.named import AT_ONCE, NamedEngine
 from ssh_abduction.replay import Log, Outcome
+from ssh_abduction.sketch import Sketch
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
@@ -61,6 +62,7 @@ from ssh_abduction.trace import Trace
 FIRST_PREFIX = 8  # steps; short enough that solving it costs next to nothing
 HELD_BACK = 1000  # maps kept until a prefix proves long enough; from there on they stream
 FIRST_PATHS = 8  # names for paths to begin with
+CAUSAL_AXIOMS = {"functional_view", "deterministic"}  # what it rests on that steps are apart
 ALL = Speedups()
 
 
@@ -95,7 +97,8 @@ class Cost:
 class Bound:
     """Lower bounds, proven, on the counts of every map of the trace; None where nothing is proven.
 
-    The order of preference proves a bound on the count that goes first. The counts after it are bounded only among the maps
+    The order of preference proves a bound on the count that goes first; a search that was stopped also counts the steps that cannot be one
+    dstate (apart.py). The counts after the first are bounded only among the maps
     that are minimal in what goes before: those bounds are in Solution.cost once the status is optimal.
     """
 
@@ -241,6 +244,7 @@ class Search:
         self._speedups = speedups
         self._on_progress = on_progress
         self._watch = Watch(limit, memory, self._report)
+        self._steps_apart: list[int] = []
         self._lower: tuple[int, ...] | None = None  # no map of the trace costs less
         self._start = len(trace) if self._whole else FIRST_PREFIX
         if after is None:
@@ -301,6 +305,9 @@ class Search:
         if self.stopped and self.status is not Status.OPTIMAL:
             if self.best is None and self.stopped == "time limit" and self._watch.has_reserve:
                 self._salvage()
+            if self.best is None:
+                self._sketch()
+            self._count_apart()
             if self.best is not None and self.status is Status.UNKNOWN:
                 self.status = Status.FEASIBLE
         if self.status in (Status.FEASIBLE, Status.OPTIMAL) and not self.count and self.best is not None:
@@ -342,16 +349,25 @@ class Search:
         )
 
     def _certificate(self) -> Certificate | None:
-        """A clique of steps that are pairwise apart, in the prefix that clingo was given, and the bound that clingo adds to it."""
-        if {"functional_view", "deterministic"} & set(self.theory.without):
+        """A clique of steps that are pairwise apart, and the bound that clingo adds to it."""
+        if CAUSAL_AXIOMS & set(self.theory.without):
             return None
-        if isinstance(self._engine, NamedEngine) and self._engine.clique:
-            steps = self._engine.clique
-        else:
-            number: dict[object, int] = {}
-            views = [number.setdefault(step.view, len(number)) for step in self.trace.steps[: min(max(self.prefix, 1), AT_ONCE)]]
-            steps = clique(apartness(views, self._log.actions[: len(views) - 1]), views)
+        steps = self._steps_apart or self._clique(self.prefix)
         return Certificate(tuple(steps), tuple(range(len(steps), self.bound.dstates or 0)))
+
+    def _clique(self, size: int) -> list[int]:
+        """Steps among the first `size` that are pairwise apart; among AT_ONCE at most, for the matrix to stay small."""
+        if isinstance(self._engine, NamedEngine) and self._engine.clique:
+            return self._engine.clique
+        number: dict[object, int] = {}
+        views = [number.setdefault(step.view, len(number)) for step in self.trace.steps[: min(max(size, 1), AT_ONCE)]]
+        return clique(apartness(views, self._log.actions[: len(views) - 1]), views)
+
+    def _count_apart(self) -> None:
+        """Where the search was stopped: the steps of the whole trace that are pairwise apart are a bound, too."""
+        if not CAUSAL_AXIOMS & set(self.theory.without):
+            self._steps_apart = self._clique(len(self.trace))
+            self.bound = replace(self.bound, dstates=max(len(self._steps_apart), self.bound.dstates or 0))
 
     def _find_cost(self) -> bool:
         """Extend the prefix until a minimal map of it replays to the end. False where the prefix has no map."""
@@ -376,7 +392,7 @@ class Search:
     def _raise_bound(self, proven: int | None) -> None:
         first = self.theory.priorities[0] if self.theory.priorities else None
         if first and proven is not None and proven > (getattr(self.bound, first) or 0):
-            self.bound = Bound(**{first: proven})
+            self.bound = replace(self.bound, **{first: proven})
 
     def _merge(self) -> None:
         """A causal map at once, that clingo has to better."""
@@ -384,6 +400,19 @@ class Search:
         if self._speedups.greedy and theory.level == "causal" and not theory.without:
             found = facts.causal_map(self._log.merged(), self.trace)
             self._keep(Found(found, (len(found.dstates),) if theory.prefer else ()), found.labels)
+
+    def _sketch(self) -> None:
+        """Where nothing was found in time: some map of the whole trace, made without a search."""
+        if not self._speedups.greedy or self.theory.without:
+            return
+        first, *rest = self.trace.steps
+        for homing in (True, False):
+            sketch = Sketch(first, self.theory, homing)
+            if all(sketch.extend(action, step) for action, step in zip(self.trace.actions, rest, strict=True)):
+                found = sketch.map()
+                cost = Cost.of(found)
+                self._keep(Found(found, tuple(getattr(cost, name) for name in self.theory.priorities)), found.labels)
+                return
 
     def _minimise(self) -> Found | None:
         """A minimal map of the prefix, or None where it has no map. Better maps of the whole trace are kept on the way."""

@@ -19,7 +19,7 @@ class Speedups:
     clique       with names: pin steps that are pairwise apart
     lazy         with names: give clingo only the links that replaying contradicts
     core_guided  with names: raise the bound from below, rather than better the map
-    greedy       causal theory: a map by merging greedily, at once, which a time limit cannot miss
+    greedy       some map without a search, for a time limit that leaves no other
     """
 
     prefixes: bool = True

@@ -168,8 +168,19 @@ def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
 
 
 def test_no_time_at_all_is_unknown_not_unsatisfiable() -> None:
-    solution = solve(drive(*TOURS["comb"]), limit=1e-9)
+    solution = solve(drive(*TOURS["comb"]), limit=1e-9, speedups=Speedups.without("greedy"))
     assert (solution.status, solution.stopped, solution.maps, solution.cost) == (Status.UNKNOWN, "time limit", (), None)
+
+
+@pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
+def test_no_time_at_all_still_leaves_a_map_and_a_bound(theory: Theory) -> None:
+    trace = drive(*TOURS["comb"])
+    solution, best = solve(trace, theory, limit=1e-9), solve(trace, theory, maps=1)
+    assert (solution.status, solution.stopped, solution.count) == (Status.FEASIBLE, "time limit", 1)
+    assert check(trace, solution.maps[0], theory) == ()
+    assert solution.certificate is not None
+    assert best.cost is not None
+    assert 1 < len(solution.certificate.clique) <= (solution.bound.dstates or 0) <= best.cost.dstates
 
 
 def test_time_limit_while_listing_keeps_the_proof() -> None:
@@ -180,7 +191,7 @@ def test_time_limit_while_listing_keeps_the_proof() -> None:
 
 
 def test_memory_limit_stops_with_a_status() -> None:
-    solution = solve(drive(*TOURS["comb"]), memory=1)
+    solution = solve(drive(*TOURS["comb"]), memory=1, speedups=Speedups.without("greedy"))
     assert (solution.status, solution.stopped) == (Status.UNKNOWN, "memory limit")
 
 

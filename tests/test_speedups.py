@@ -75,6 +75,7 @@ def test_as_many_maps_as_asked_for(most: int) -> None:
     assert found.complete == (every.count <= most)
 
 
+@settings(deadline=None, derandomize=True)
 @given(machines(most_steps=40))
 def test_merging_greedily_gives_a_map(trace: Trace) -> None:
     theory = Theory.causal()
@@ -84,6 +85,7 @@ def test_merging_greedily_gives_a_map(trace: Trace) -> None:
     assert check(trace, found.maps[0], theory) == ()
 
 
+@settings(deadline=None, derandomize=True)
 @given(machines(most_steps=30))
 def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
     """The matrix against its definition, step by step; and every step of the clique is apart from every other."""

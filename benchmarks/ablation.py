@@ -1,0 +1,59 @@
+"""What each speed-up gains: the time with it switched off, as a ratio to the time with all of them, measured in one run.
+
+    python benchmarks/ablation.py [--limit S] [--memory MIB] [--only PATTERN] [--out benchmarks/results/ablation.json]
+
+The table is in the form of bench.py, with the solver without a speed-up in place of a peer; "without all" is the plain encoding of the
+axioms, whole trace at once. `python benchmarks/readme.py benchmarks/results/ablation.json docs/performance.md` writes it there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from bench import machine, packages, run, store
+from suite import SUITE, Instance, full_maze
+from table import OURS, WITHOUT, times
+
+from ssh_abduction.speedups import SPEEDUPS
+
+CAUSAL = ["rectangle n=400", "rectangle n=40000", "moore 8/2 n=800", "moore 30/10 n=200", "moore 100/10 n=3200"]
+CAUSAL += ["maze 2x2 n=1600", "maze 3x3 n=1600", "maze 4x4 n=1600"]
+FULL = ["full rectangle n=400", "full maze 2x2 n=60", "full taylor-hall", "full aces3"]
+ONLY_CAUSAL = {"names", "clique", "lazy", "core_guided", "greedy"}
+INSTANCES = SUITE | {full_maze.name: full_maze}
+
+
+def variants(instance: Instance) -> list[str]:
+    """The speed-ups to leave out, one at a time and all: those that the theory of the instance uses."""
+    used = [name for name in SPEEDUPS if instance.causal == (name in ONLY_CAUSAL) or name == "prefixes"]
+    return [*used, ",".join(SPEEDUPS)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--limit", type=float, default=10, metavar="S", help="seconds a cell has (default 10)")
+    parser.add_argument("--memory", type=int, default=4096, metavar="MIB", help="address space a cell has, in MiB (default 4096)")
+    parser.add_argument("--only", default="", metavar="PATTERN", help="instances whose name this regular expression is found in")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "ablation.json", metavar="RESULTS.json")
+    options = parser.parse_args()
+    results: dict[str, Any] = {"date": datetime.date.today().isoformat(), "limit": options.limit, "memory": options.memory, "seeds": 1}
+    results |= {"machine": machine(), "packages": {k: v for k, v in packages().items() if k in (OURS, "clingo")}, "cells": []}
+    for name in CAUSAL + FULL:
+        if re.search(options.only, name):
+            for off in ["", *variants(INSTANCES[name])]:
+                tool = OURS + (WITHOUT + off if off else "")
+                cell = run(tool, INSTANCES[name], 0, options.limit, options.memory)
+                cell["tool"] = OURS if not off else f"−{off}" if "," not in off else "−all"
+                print(f"{name:24} {cell['tool']:14} {cell['status']:14} {cell.get('seconds', 0):8.2f} s", file=sys.stderr)
+                results["cells"].append(cell)
+                store(results, options.out)
+    print(times(results))
+
+
+if __name__ == "__main__":
+    main()
