@@ -8,6 +8,7 @@ It stands between two comments that mark it; what is around them stays.
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
 from pathlib import Path
@@ -26,7 +27,7 @@ def block(results: dict[str, Any], source: str) -> str:
     return (
         f"{times(results)}\n\n"
         f"{results['date']}, {machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, {versions}; "
-        f"{results['limit']:g} s and {results['memory']:,} MiB a cell, {seeds}. From `{source}`.\n"
+        f"{results['limit']:g} s and {results['memory']:,} MiB a cell, {seeds}. From [`{source}`]({source}).\n"
     )
 
 
@@ -37,9 +38,10 @@ def rewritten(readme: str, results: dict[str, Any], source: str) -> str:
 
 def main() -> None:
     path = Path(sys.argv[1]).resolve()
-    readme = Path(sys.argv[2]) if len(sys.argv) > 2 else ROOT / "README.md"
+    page = Path(sys.argv[2]).resolve() if len(sys.argv) > 2 else ROOT / "README.md"
     results = json.loads(path.read_text(encoding="utf-8"))
-    readme.write_text(rewritten(readme.read_text(encoding="utf-8"), results, path.relative_to(ROOT).as_posix()), encoding="utf-8")
+    source = os.path.relpath(path, page.parent).replace(os.sep, "/")
+    page.write_text(rewritten(page.read_text(encoding="utf-8"), results, source), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -47,6 +47,22 @@ def apartness(seen: Sequence[int], actions: Sequence[int]) -> Matrix:
     return apart
 
 
+def apart_from(seen: Sequence[int], actions: Sequence[int], step: int) -> Matrix:
+    """Which steps are apart from this one: a column of the matrix without the matrix, for traces too long for that."""
+    shown, done = np.asarray(seen), np.asarray(actions)
+    apart = np.zeros(len(shown), dtype=bool)
+    left = np.delete(np.arange(len(shown)), step)  # steps that went on as this one, so far
+    for ahead in range(len(shown) - step):
+        left = left[left + ahead < len(shown)]
+        differs = shown[left + ahead] != shown[step + ahead]
+        apart[left[differs]] = True
+        left = left[~differs & (left + ahead < len(done))]
+        if not len(left) or step + ahead == len(done):
+            break
+        left = left[done[left + ahead] == done[step + ahead]]
+    return apart
+
+
 def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
     """A large clique of steps, in order. As steps with different views are always apart, each view has a clique of its own."""
     shown = np.asarray(seen)

@@ -24,14 +24,14 @@ import clingo
 import numpy as np
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.apart import apartness, clique
+from ssh_abduction.apart import apart_from, apartness, clique
 from ssh_abduction.engine import Engine, Found, Watch
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
-AT_ONCE = 8000  # steps of a trace that is given whole; the matrix of pairs has the square of that many bytes
+AT_ONCE = 8000  # steps of a trace that is given whole; the matrix of their pairs has the square of that many bytes
 FIRST_PREFIXES = 32  # steps of a prefix that is tried before that
 HELD_BACK = 100  # maps that are kept until all links are given; then they stream
 SPARES = 3  # spare names of a view, to begin with
@@ -65,13 +65,13 @@ class NamedEngine(Engine):
         began = time.perf_counter()
         self.size = size
         seen = self._log.seen[:size]
-        apart = apartness(seen, self._log.actions[: size - 1])
+        actions = self._log.actions[: size - 1]
+        apart = apartness(seen[:AT_ONCE], actions[: AT_ONCE - 1])
         self._watch.check()
-        self.clique = clique(apart, seen) if self._speedups.clique else [0]
+        self.clique = clique(apart, seen[:AT_ONCE]) if self._speedups.clique else [0]
         pinned = {step: name for name, step in enumerate(self.clique)}
-        compatible = ~apart[:, self.clique]
-        same_view = np.asarray(seen)[:, None] == np.asarray(seen)[self.clique][None, :]
-        self._may_be = [[pinned[t]] if t in pinned else row.nonzero()[0].tolist() for t, row in enumerate(compatible & same_view)]
+        columns = apart[:, self.clique] if size <= AT_ONCE else np.stack([apart_from(seen, actions, t) for t in self.clique], axis=1)
+        self._may_be = [[pinned[t]] if t in pinned else (~row).nonzero()[0].tolist() for t, row in enumerate(columns)]
         self._spares = dict.fromkeys(seen, SPARES)
         self._links = dict.fromkeys(range(size - 1))
         if self._speedups.lazy:

@@ -15,6 +15,9 @@ from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Step, Trace
 
 
+TRIED = 100  # dstates of a view that a step may be merged with
+
+
 class Outcome(Enum):
     """How a replay ended."""
 
@@ -84,13 +87,14 @@ class Log:
         """
         actions, seen = self.actions, self.seen
         shows = [seen[0]]
+        like = {seen[0]: [0]}  # the first dstates that show a view: as many as are tried
         links: dict[tuple[int, int], int] = {}
         labels = [0]
         while len(labels) < len(seen):
             t = len(labels)
             key = (labels[-1], actions[t - 1])
             best, most = [len(shows)], 0
-            for label in (s for s, view in enumerate(shows) if view == seen[t]):
+            for label in like.setdefault(seen[t], []):
                 links[key] = label
                 found = [label]
                 while (end := t + len(found)) < len(seen) and (following := links.get((found[-1], actions[end - 1]))) is not None:
@@ -101,6 +105,8 @@ class Log:
                     if len(found) > most:
                         best, most = found, len(found)
             if not most:
+                if len(like[seen[t]]) < TRIED:
+                    like[seen[t]].append(len(shows))
                 shows.append(seen[t])
             links[key] = best[0]
             labels += best

@@ -18,6 +18,7 @@ from peers import PEERS, Machine, Words
 from suite import SUITE
 
 from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.speedups import SPEEDUPS
 
 ROOT = Path(__file__).parent.parent
 STORED = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
@@ -144,6 +145,15 @@ def test_a_stored_run_has_its_fields_and_no_contradiction(path: Path) -> None:
         assert cell.keys() >= MEASURED or cell["status"] in ("not applicable", "not installed", "error")
         assert cell["status"] != "ok" or cell.keys() >= {"dstates", "proven"} | (OURS if cell["tool"] == "ssh-abduction" else set())
     assert table.contradictions(run) == []
+
+
+def test_the_page_on_performance_shows_a_stored_run() -> None:
+    page = ROOT / "docs" / "performance.md"
+    text = page.read_text()
+    run = json.loads((ROOT / "benchmarks" / "results" / "ablation.json").read_text())
+    assert readme.rewritten(text, run, "../benchmarks/results/ablation.json") == text
+    off = {cell["tool"].removeprefix("−") for cell in run["cells"]} - {"ssh-abduction", "all"}
+    assert off == set(SPEEDUPS)
 
 
 def test_the_readme_shows_a_stored_run(tmp_path: Path) -> None:

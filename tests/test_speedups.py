@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from strategies import traces
 
 from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, named, solve
-from ssh_abduction.apart import apartness, clique
+from ssh_abduction.apart import apart_from, apartness, clique
 from ssh_abduction.checker import check
 from ssh_abduction.replay import Log
 
@@ -97,6 +97,7 @@ def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
             while log.seen[i + k] == log.seen[j + k] and log.actions[i + k : i + k + 1] == log.actions[j + k : j + k + 1] != []:
                 k += 1
             assert apart[i, j] == (log.seen[i + k] != log.seen[j + k])
+        assert apart_from(log.seen, log.actions, i).tolist() == apart[i].tolist()
     steps = clique(apart, log.seen)
     assert steps == sorted(set(steps))
     assert all(apart[i, j] for i in steps for j in steps if i != j)
