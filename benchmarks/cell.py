@@ -18,13 +18,14 @@ import resource
 import signal
 import sys
 import time
+from dataclasses import asdict
 from typing import Any
 
 from peers import PEERS, Machine, NotApplicableError
 from suite import SUITE, full_maze
 from table import OURS, WITHOUT
 
-from ssh_abduction import Solution, Speedups, Theory, Trace, solve
+from ssh_abduction import Search, Solution, Speedups, Theory, Trace
 from ssh_abduction.checker import check
 from ssh_abduction.engine import peak_memory
 from ssh_abduction.solver import Status
@@ -53,7 +54,8 @@ def main() -> None:
             if tool.startswith(OURS):
                 end_after(limit * (1 + MARGIN) + 1)
                 speedups = Speedups.without(tool.removeprefix(OURS).removeprefix(WITHOUT))
-                answer = solve(trace, theory, limit=limit, memory=int(SHARE * space), maps=1, speedups=speedups)
+                search = Search(trace, theory, limit=limit, memory=int(SHARE * space), maps=1, speedups=speedups)
+                answer = search.solution(tuple(search))
             else:
                 end_after(limit)
                 answer = PEERS[tool].find(trace)
@@ -65,7 +67,11 @@ def main() -> None:
     spent = {"seconds": time.perf_counter() - began, "cpu": time.process_time() - cpu, "memory": peak_memory()}
     end_after(AROUND)
     if not outcome:
-        outcome = of_solution(answer, trace, theory) if tool.startswith(OURS) else of_machine(answer, trace, PEERS[tool].proves)
+        outcome = (
+            {**of_solution(answer, trace, theory), **asdict(search.grounding)}
+            if tool.startswith(OURS)
+            else of_machine(answer, trace, PEERS[tool].proves)
+        )
     if outcome["status"] == "ok" and spent["seconds"] > limit:
         outcome["status"] = "timeout"
     say(**outcome, **{name: round(value, 5) for name, value in spent.items()})
@@ -85,8 +91,6 @@ def of_solution(solution: Solution, trace: Trace, theory: Theory) -> dict[str, A
         "prefix": solution.prefix,
         "ground": round(solution.seconds.ground, 5),
         "solve": round(solution.seconds.solve, 5),
-        "rules": solution.grounding.rules,
-        "atoms": solution.grounding.atoms,
     }
 
 

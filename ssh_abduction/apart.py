@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ssh_abduction.errors import SolverError
 from ssh_abduction.trace import Trace
 
-SWAPS = 60  # attempts to better the clique, for each view
+SWAPS = 60  # attempts to better the clique of a view, at most; fewer where it has few steps
 
 Matrix = NDArray[np.bool_]
 
@@ -77,7 +77,7 @@ def _clique(apart: Matrix) -> list[int]:
     """Greedily the step that is apart from most of those left, then swaps: take some out, fill up again, keep what is no smaller."""
     random = np.random.default_rng(0)
     best = _filled(apart, [], random)
-    for _ in range(SWAPS if 1 < len(best) < len(apart) else 0):
+    for _ in range(min(SWAPS, len(apart) // 8) if 1 < len(best) < len(apart) else 0):
         kept = random.permutation(best)[random.integers(1, len(best)) :]
         other = _filled(apart, kept.tolist(), random)
         best = other if len(other) >= len(best) else best

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, TypeVar
 
@@ -100,6 +103,23 @@ def peak_memory() -> float:
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 
 
+@contextmanager
+def _held_back_interrupts() -> Iterator[None]:
+    """Ctrl-C waits until this is over: raised while clingo starts its thread, it would leave the thread without an owner."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is None or threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+        yield
+        return
+    caught: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: caught.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if caught and callable(before):
+        before(signal.SIGINT, None)
+
+
 Answer = TypeVar("Answer")
 
 
@@ -114,13 +134,21 @@ class Engine:
         self.size = 0
         self.paths = paths
         self.bound: int | None = None
-        self.grounding = Grounding(0, 0)  # of the last call of clingo that came to an end
         self.ground_seconds = 0.0
         self.solve_seconds = 0.0
         self._trace = trace
         self._theory = theory
         self._watch = watch
         self._control = clingo.Control(["--warn=none"])
+
+    @property
+    def grounding(self) -> Grounding:
+        """The size of the program of clingo's last call that came to an end. Takes a millisecond, as clingo tells all it counts."""
+        try:
+            program = self._control.statistics["problem"]["lp"]
+        except (RuntimeError, KeyError):  # no call came to an end
+            return Grounding(0, 0)
+        return Grounding(int(program["rules"]), int(program["atoms"]))
 
     def grow(self, size: int) -> None:
         """Let the prefix have `size` steps."""
@@ -163,7 +191,9 @@ class Engine:
         configuration.project = "project" if not mode.startswith("opt") else "no"
         configuration.solve_limit = f"{conflicts},-1"
         began = time.perf_counter()
-        with self._control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound) as handle:
+        with ExitStack() as stack:
+            with _held_back_interrupts():
+                handle = stack.enter_context(self._control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound))
             try:
                 while True:
                     handle.resume()
@@ -175,8 +205,6 @@ class Engine:
                         result = handle.get()
                         if result.interrupted and conflicts < 0:
                             raise Stopped("interrupted")
-                        program = self._control.statistics["problem"]["lp"]
-                        self.grounding = Grounding(int(program["rules"]), int(program["atoms"]))
                         return bool(result.exhausted)
                     answer = read(model)
                     self.solve_seconds += time.perf_counter() - began

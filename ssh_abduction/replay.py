@@ -14,7 +14,6 @@ from enum import Enum
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Step, Trace
 
-
 TRIED = 100  # dstates of a view that a step may be merged with
 
 

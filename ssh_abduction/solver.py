@@ -62,6 +62,7 @@ from ssh_abduction.trace import Trace
 FIRST_PREFIX = 8  # steps; short enough that solving it costs next to nothing
 HELD_BACK = 1000  # maps kept until a prefix proves long enough; from there on they stream
 FIRST_PATHS = 8  # names for paths to begin with
+FEW_STEPS = 24  # a trace of so many is not worth names given beforehand
 CAUSAL_AXIOMS = {"functional_view", "deterministic"}  # what it rests on that steps are apart
 ALL = Speedups()
 
@@ -145,7 +146,6 @@ class Solution:
     steps      length of the trace
     prefix     how many of its first steps had to be given to clingo
     stopped    why the search ended before it was complete, else None
-    grounding  rules and atoms of the ground program that clingo solved
     certificate  why no map has fewer dstates; None where the theory is without an axiom that this rests on
     partial    where no map of the whole trace was found: the best map of its first steps
     """
@@ -159,7 +159,6 @@ class Solution:
     steps: int
     prefix: int
     seconds: Seconds
-    grounding: Grounding
     certificate: Certificate | None = None
     stopped: Stop | None = None
     partial: SSHMap | None = None
@@ -251,7 +250,8 @@ class Search:
             self._engine = self._new_engine()
             return
         self._watch.use_reserve()
-        self._engine = after._engine.over(trace, self._watch, self._log)
+        outgrown = isinstance(after._engine, StepEngine) and self._names_pay()
+        self._engine = self._new_engine() if outgrown else after._engine.over(trace, self._watch, self._log)
         if after.stopped == "interrupted":  # perhaps while a step was grounded
             self._engine = self._engine.with_paths(self._engine.paths)
         if not self._whole:
@@ -260,9 +260,15 @@ class Search:
         if minimal is not None:
             self.status, self.best, self._cost = Status.OPTIMAL, minimal, after._cost
 
+    def _names_pay(self) -> bool:
+        """Whether the theory lets dstates have names beforehand, and the trace is long enough for that to pay."""
+        theory = self.theory
+        causal = theory.level == "causal" and theory.prefer == ("dstates",) and not theory.without
+        return causal and self._speedups.names and len(self.trace) > FEW_STEPS
+
     def _new_engine(self) -> Engine:
         theory = self.theory
-        if self._speedups.names and theory.level == "causal" and theory.prefer == ("dstates",) and not theory.without:
+        if self._names_pay():
             return NamedEngine(self.trace, theory, self._watch, self._log, self._speedups)
         most = facts.most_paths(self.trace, theory, len(self.trace))
         return StepEngine(self.trace, theory, self._watch, min(FIRST_PATHS, most) if self._speedups.path_names else most)
@@ -271,6 +277,11 @@ class Search:
     def prefix(self) -> int:
         """How many steps clingo was given."""
         return self._engine.size
+
+    @property
+    def grounding(self) -> Grounding:
+        """Rules and atoms of the ground program that clingo solved last."""
+        return self._engine.grounding
 
     def __iter__(self) -> Iterator[SSHMap]:
         if self._begun:
@@ -341,7 +352,6 @@ class Search:
             theory=self.theory,
             steps=len(self.trace),
             prefix=self.prefix,
-            grounding=self._engine.grounding,
             certificate=self._certificate(),
             seconds=Seconds(self._watch.elapsed(), self._engine.ground_seconds, self._engine.solve_seconds),
             stopped=self.stopped,

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import traces
 
-from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, named, solve
+from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, named, solve, solver
 from ssh_abduction.apart import apart_from, apartness, clique
 from ssh_abduction.checker import check
 from ssh_abduction.replay import Log
@@ -44,7 +44,8 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trac
     at_once = data.draw(st.sampled_from([4, 8000]), label="at once")
     patience = data.draw(st.sampled_from([0, 1, 2000]), label="patience")
     held = data.draw(st.sampled_from([1, 100]), label="held back")
-    with patch.multiple(named, FIRST_PREFIXES=first, AT_ONCE=at_once, PATIENCE=patience, HELD_BACK=held):
+    settings = patch.multiple(named, FIRST_PREFIXES=first, AT_ONCE=at_once, PATIENCE=patience, HELD_BACK=held)
+    with settings, patch.object(solver, "FEW_STEPS", 0):
         found = solve(trace, Theory.causal(), maps=0, speedups=Speedups.without(off))
     assert found.status is expected.status is Status.OPTIMAL
     assert found.cost == expected.cost
@@ -79,7 +80,7 @@ def test_as_many_maps_as_asked_for(most: int) -> None:
 @given(machines(most_steps=40))
 def test_merging_greedily_gives_a_map(trace: Trace) -> None:
     theory = Theory.causal()
-    with patch.object(named.NamedEngine, "grow", side_effect=KeyboardInterrupt):
+    with patch.object(named.NamedEngine, "grow", side_effect=KeyboardInterrupt), patch.object(solver, "FEW_STEPS", 0):
         found = solve(trace, theory)
     assert found.status is Status.FEASIBLE
     assert check(trace, found.maps[0], theory) == ()
@@ -106,7 +107,8 @@ def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
 def test_a_search_without_greedy_merging_has_a_bound_when_time_is_over() -> None:
     """The clique is a bound before clingo has said anything."""
     trace = Trace.from_steps("abcabd", ["travel"] * 5)
-    search = Search(trace, Theory.causal(), speedups=Speedups.without("greedy"))
+    with patch.object(solver, "FEW_STEPS", 0):
+        search = Search(trace, Theory.causal(), speedups=Speedups.without("greedy"))
     with patch.object(named.NamedEngine, "improving_maps", side_effect=KeyboardInterrupt):
         assert list(search) == []
     assert search.bound.dstates == 4 + 2  # a, b, c, d, and the first a and b, which lead to another c and d

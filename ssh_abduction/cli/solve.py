@@ -128,7 +128,7 @@ def ending(search: Search, solution: Solution, explanation: Explanation | None) 
         "cost": solution.cost.to_dict() if solution.cost else None,
         "bound": solution.bound.to_dict(),
         "prefix": solution.prefix,
-        "grounding": asdict(solution.grounding),
+        "grounding": asdict(search.grounding),
         "seconds": {k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")},
     }
     if solution.certificate:
