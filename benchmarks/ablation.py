@@ -16,16 +16,15 @@ from pathlib import Path
 from typing import Any
 
 from bench import machine, packages, run, store
-from suite import SUITE, Instance, full_maze
+from suite import INSTANCES, SMALL, Instance
 from table import OURS, WITHOUT, times
 
 from ssh_abduction.speedups import SPEEDUPS
 
 CAUSAL = ["rectangle n=400", "rectangle n=40000", "moore 8/2 n=800", "moore 30/10 n=200", "moore 100/10 n=3200"]
 CAUSAL += ["maze 2x2 n=1600", "maze 3x3 n=1600", "maze 4x4 n=1600"]
-FULL = ["full rectangle n=400", "full maze 2x2 n=60", "full taylor-hall", "full aces3"]
+FULL = ["full rectangle n=400", SMALL.name, "full taylor-hall", "full aces3"]
 ONLY_CAUSAL = {"names", "clique", "lazy", "core_guided", "greedy"}
-INSTANCES = SUITE | {full_maze.name: full_maze}
 
 
 def variants(instance: Instance) -> list[str]:

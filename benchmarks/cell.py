@@ -22,7 +22,7 @@ from dataclasses import asdict
 from typing import Any
 
 from peers import PEERS, Machine, NotApplicableError
-from suite import SUITE, full_maze
+from suite import INSTANCES
 from table import OURS, WITHOUT
 
 from ssh_abduction import Search, Solution, Speedups, Theory, Trace
@@ -37,7 +37,7 @@ SHARE = 0.8  # of the memory is its own limit, for the same reason
 
 def main() -> None:
     tool, name, seed, seconds, memory = sys.argv[1:]
-    instance, limit, space = (SUITE | {full_maze.name: full_maze})[name], float(seconds), int(memory)
+    instance, limit, space = INSTANCES[name], float(seconds), int(memory)
     end_after(AROUND)
     for module in PEERS[tool].modules if tool in PEERS else ():
         importlib.import_module(module)

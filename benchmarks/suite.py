@@ -71,7 +71,6 @@ def _maze(side: int, steps: int, *, full: bool = False) -> Instance:
     return Instance(f"{'full ' if full else ''}maze {side}x{side} n={steps}", lambda seed: walk(seed=seed))
 
 
-full_maze = _maze(2, 60, full=True)  # what the plain encoding can still do
 SUITE = {
     instance.name: instance
     for instance in (
@@ -91,3 +90,5 @@ SUITE = {
         Instance("full aces3", lambda _: aces3(), seeded=False),
     )
 }
+SMALL = _maze(2, 60, full=True)  # what the full theory's plain encoding can still do: for ablation.py
+INSTANCES = {**SUITE, SMALL.name: SMALL}

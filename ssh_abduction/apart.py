@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ssh_abduction.errors import SolverError
 from ssh_abduction.trace import Trace
 
+RESTS_ON = frozenset({"functional_view", "deterministic"})  # the axioms that make apart steps different dstates
 SWAPS = 60  # attempts to better the clique of a view, at most; fewer where it has few steps
 
 Matrix = NDArray[np.bool_]

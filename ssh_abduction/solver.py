@@ -48,7 +48,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from ssh_abduction import facts
-from ssh_abduction.apart import Certificate, apartness, clique
+from ssh_abduction.apart import RESTS_ON, Certificate, apartness, clique
 from ssh_abduction.engine import Engine, Found, Grounding, StepEngine, Stop, Stopped, Watch
 from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.maps import SSHMap
@@ -63,7 +63,6 @@ FIRST_PREFIX = 8  # steps; short enough that solving it costs next to nothing
 HELD_BACK = 1000  # maps kept until a prefix proves long enough; from there on they stream
 FIRST_PATHS = 8  # names for paths to begin with
 FEW_STEPS = 24  # a trace of so many is not worth names given beforehand
-CAUSAL_AXIOMS = {"functional_view", "deterministic"}  # what it rests on that steps are apart
 ALL = Speedups()
 
 
@@ -360,7 +359,7 @@ class Search:
 
     def _certificate(self) -> Certificate | None:
         """A clique of steps that are pairwise apart, and the bound that clingo adds to it."""
-        if CAUSAL_AXIOMS & set(self.theory.without):
+        if RESTS_ON & set(self.theory.without):
             return None
         steps = self._steps_apart or self._clique(self.prefix)
         return Certificate(tuple(steps), tuple(range(len(steps), self.bound.dstates or 0)))
@@ -375,7 +374,7 @@ class Search:
 
     def _count_apart(self) -> None:
         """Where the search was stopped: the steps of the whole trace that are pairwise apart are a bound, too."""
-        if not CAUSAL_AXIOMS & set(self.theory.without):
+        if not RESTS_ON & set(self.theory.without):
             self._steps_apart = self._clique(len(self.trace))
             self.bound = replace(self.bound, dstates=max(len(self._steps_apart), self.bound.dstates or 0))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from ssh_abduction.apart import RESTS_ON
 from ssh_abduction.checker import check
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.errors import MapError
@@ -47,7 +48,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _bound(trace: Trace, data: Any, theory: Theory, fewest: int | None) -> bool:
     """Print what the certificate of the file proves. Says whether it holds."""
-    if {"functional_view", "deterministic"} - set(theory.axioms):
+    if RESTS_ON - set(theory.axioms):
         raise MapError("bound: expected a theory with the axioms functional_view and deterministic, which the proof rests on")
     if not isinstance(data, dict) or "certificate" not in data:
         raise MapError("certificate: expected one beside the maps, got none; use what solve --json printed")
