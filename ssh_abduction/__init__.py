@@ -1,6 +1,6 @@
 """From what a robot saw and did, find the map: every minimal map of distinctive states, places and paths."""
 
-from ssh_abduction.apart import Certificate
+from ssh_abduction.certificate import Certificate
 from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
 from ssh_abduction.maps import DState, Path, SSHMap
 from ssh_abduction.online import OnlineMapper

@@ -4,29 +4,15 @@ Two steps are *apart* if some actions, done from both, lead to different views: 
 deterministic, they are different dstates. On a trace, what was done from a step is how the trace goes on; so the steps are apart if
 their continuations show different views before, or when, the actions differ. Steps that are pairwise apart, a *clique*, need as many
 dstates as they are, in every theory that holds the axioms functional_view and deterministic. A `Certificate` is such a clique.
-
->>> from ssh_abduction import Trace, solve
->>> trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
->>> solve(trace).certificate.clique
-(0, 1, 2, 3)
->>> solve(trace).certificate.words(trace)[0, 2]
-('travel',)
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.errors import SolverError
-from ssh_abduction.trace import Trace
-
-RESTS_ON = frozenset({"functional_view", "deterministic"})  # the axioms that make apart steps different dstates
 SWAPS = 60  # attempts to better the clique of a view, at most; fewer where it has few steps
 
 Matrix = NDArray[np.bool_]
@@ -96,40 +82,3 @@ def _filled(apart: Matrix, kept: list[int], random: np.random.Generator) -> list
         stay = np.flatnonzero(inner[best])
         left, inner = left[stay], inner[np.ix_(stay, stay)]
     return found
-
-
-@dataclass(frozen=True, slots=True)
-class Certificate:
-    """Why no map has fewer dstates.
-
-    clique   steps that are pairwise apart, so that each is a dstate of its own; proof.check_bound checks it, without a solver
-    refuted  numbers of dstates, from the size of the clique up, for which clingo found that there is no map
-    """
-
-    clique: tuple[int, ...]
-    refuted: tuple[int, ...] = ()
-
-    @property
-    def bound(self) -> int:
-        """The number of dstates that every map has at least."""
-        return len(self.clique) + len(self.refuted)
-
-    def words(self, trace: Trace) -> dict[tuple[int, int], tuple[str, ...]]:
-        """For each pair of steps of the clique the common actions that lead from them to different views. Raises SolverError."""
-        return {pair: _word(trace, *pair) for pair in combinations(self.clique, 2)}
-
-    def to_dict(self, trace: Trace) -> dict[str, Any]:
-        """Plain data. Pairs that show different views at once need no word, and are left out."""
-        words = [[i, j, list(word)] for (i, j), word in self.words(trace).items() if word]
-        return {"clique": list(self.clique), "words": words, "refuted": list(self.refuted)}
-
-
-def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:
-    word: list[str] = []
-    while True:
-        here, there = trace.steps[i + len(word)], trace.steps[j + len(word)]
-        if here.view != there.view:
-            return tuple(word)
-        if here.action is None or there.action is None or here.action.name != there.action.name:
-            raise SolverError(f"clique: expected steps that are apart, got {i} and {j}, which may be one dstate")
-        word.append(here.action.name)

@@ -23,6 +23,7 @@ from ssh_abduction.trace import Trace
 RESERVE = 0.2  # share of the time limit kept for finding any map of the whole trace
 GROWTH = 1.25  # a prefix grows at least by this factor, so that there are few
 POLL = 0.05  # seconds between looks at the clock and for Ctrl-C
+AT_ONCE = 8000  # steps that are compared in pairs; the matrix has the square of that many bytes
 TICK = 0.5  # seconds between reports of progress while clingo is busy
 
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
@@ -128,12 +129,14 @@ class Engine:
 
     bound   lower bound, proven, on the count that is preferred first; None where nothing is known before a search ends
     paths   how many names for paths there are
+    clique  steps that are pairwise apart (apart.py), if it needs to know some
     """
 
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, paths: int = 0) -> None:
         self.size = 0
         self.paths = paths
         self.bound: int | None = None
+        self.clique: list[int] = []
         self.ground_seconds = 0.0
         self.solve_seconds = 0.0
         self._trace = trace

@@ -25,13 +25,12 @@ import numpy as np
 
 from ssh_abduction import encodings, facts
 from ssh_abduction.apart import apart_from, apartness, clique
-from ssh_abduction.engine import Engine, Found, Watch
+from ssh_abduction.engine import AT_ONCE, Engine, Found, Watch
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
-AT_ONCE = 8000  # steps of a trace that is given whole; the matrix of their pairs has the square of that many bytes
 FIRST_PREFIXES = 32  # steps of a prefix that is tried before that
 HELD_BACK = 100  # maps that are kept until all links are given; then they stream
 SPARES = 3  # spare names of a view, to begin with
@@ -45,7 +44,6 @@ class NamedEngine(Engine):
         super().__init__(trace, theory, watch)
         self._log = log
         self._speedups = speedups
-        self.clique: list[int] = []
 
     def with_paths(self, paths: int) -> NamedEngine:
         return NamedEngine(self._trace, self._theory, self._watch, self._log, self._speedups)

@@ -44,15 +44,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from ssh_abduction import facts
-from ssh_abduction.apart import RESTS_ON, Certificate, apartness, clique
-from ssh_abduction.engine import Engine, Found, Grounding, StepEngine, Stop, Stopped, Watch
+from ssh_abduction.certificate import RESTS_ON, Certificate, Evidence
+from ssh_abduction.engine import AT_ONCE, Engine, Found, Grounding, StepEngine, Stop, Stopped, Watch
 from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.named import AT_ONCE, NamedEngine
 from ssh_abduction.replay import Log, Outcome
 from ssh_abduction.sketch import Sketch
 from ssh_abduction.speedups import Speedups
@@ -145,7 +144,7 @@ class Solution:
     steps      length of the trace
     prefix     how many of its first steps had to be given to clingo
     stopped    why the search ended before it was complete, else None
-    certificate  why no map has fewer dstates; None where the theory is without an axiom that this rests on
+    evidence   what the certificate is made from; None where the theory is without an axiom that this rests on
     partial    where no map of the whole trace was found: the best map of its first steps
     """
 
@@ -158,9 +157,14 @@ class Solution:
     steps: int
     prefix: int
     seconds: Seconds
-    certificate: Certificate | None = None
+    evidence: Evidence | None = field(default=None, repr=False)
     stopped: Stop | None = None
     partial: SSHMap | None = None
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """Why no map has fewer dstates. Worked out when it is first asked for; None where there is no evidence."""
+        return self.evidence.certificate if self.evidence else None
 
     @property
     def count(self) -> int:
@@ -236,13 +240,13 @@ class Search:
         self.count = 0
         self._cost: tuple[int, ...] = ()
         self._begun = False
+        self._apart: Evidence | None = None  # of the whole trace, where the search was stopped
         self._most = maps
         self._log = Log(trace, self.theory)
         self._whole = not speedups.prefixes or bool(self.theory.without)
         self._speedups = speedups
         self._on_progress = on_progress
         self._watch = Watch(limit, memory, self._report)
-        self._steps_apart: list[int] = []
         self._lower: tuple[int, ...] | None = None  # no map of the trace costs less
         self._start = len(trace) if self._whole else FIRST_PREFIX
         if after is None:
@@ -268,6 +272,8 @@ class Search:
     def _new_engine(self) -> Engine:
         theory = self.theory
         if self._names_pay():
+            from ssh_abduction.named import NamedEngine  # loads numpy, which takes longer than to solve a short trace
+
             return NamedEngine(self.trace, theory, self._watch, self._log, self._speedups)
         most = facts.most_paths(self.trace, theory, len(self.trace))
         return StepEngine(self.trace, theory, self._watch, min(FIRST_PATHS, most) if self._speedups.path_names else most)
@@ -351,32 +357,28 @@ class Search:
             theory=self.theory,
             steps=len(self.trace),
             prefix=self.prefix,
-            certificate=self._certificate(),
+            evidence=self._evidence(self.prefix) if self._apart is None else self._apart,
             seconds=Seconds(self._watch.elapsed(), self._engine.ground_seconds, self._engine.solve_seconds),
             stopped=self.stopped,
             partial=None if self.best else self.partial,
         )
 
-    def _certificate(self) -> Certificate | None:
-        """A clique of steps that are pairwise apart, and the bound that clingo adds to it."""
+    def _evidence(self, size: int) -> Evidence | None:
+        """What shows that no map has fewer dstates: of the first `size` steps, and of AT_ONCE at most."""
         if RESTS_ON & set(self.theory.without):
             return None
-        steps = self._steps_apart or self._clique(self.prefix)
-        return Certificate(tuple(steps), tuple(range(len(steps), self.bound.dstates or 0)))
-
-    def _clique(self, size: int) -> list[int]:
-        """Steps among the first `size` that are pairwise apart; among AT_ONCE at most, for the matrix to stay small."""
-        if isinstance(self._engine, NamedEngine) and self._engine.clique:
-            return self._engine.clique
+        proven = self.bound.dstates or 0
+        if self._engine.clique:
+            return Evidence((), (), proven, tuple(self._engine.clique))
         number: dict[object, int] = {}
-        views = [number.setdefault(step.view, len(number)) for step in self.trace.steps[: min(max(size, 1), AT_ONCE)]]
-        return clique(apartness(views, self._log.actions[: len(views) - 1]), views)
+        views = tuple(number.setdefault(step.view, len(number)) for step in self.trace.steps[: min(max(size, 1), AT_ONCE)])
+        return Evidence(views, tuple(self._log.actions[: len(views) - 1]), proven)
 
     def _count_apart(self) -> None:
         """Where the search was stopped: the steps of the whole trace that are pairwise apart are a bound, too."""
-        if not RESTS_ON & set(self.theory.without):
-            self._steps_apart = self._clique(len(self.trace))
-            self.bound = replace(self.bound, dstates=max(len(self._steps_apart), self.bound.dstates or 0))
+        self._apart = self._evidence(len(self.trace))
+        if self._apart:
+            self.bound = replace(self.bound, dstates=max(len(self._apart.certificate.clique), self.bound.dstates or 0))
 
     def _find_cost(self) -> bool:
         """Extend the prefix until a minimal map of it replays to the end. False where the prefix has no map."""

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import pickle
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +16,12 @@ from hypothesis import given, settings
 from test_solver import wandering
 from test_speedups import machines
 
-from ssh_abduction import MapError, Theory, Trace, solve
+from ssh_abduction import MapError, OnlineMapper, Search, Theory, Trace, solve
+from ssh_abduction.apart import apartness, clique
+from ssh_abduction.certificate import Evidence
 from ssh_abduction.cli import main
 from ssh_abduction.proof import check_bound
+from ssh_abduction.replay import Log
 
 
 @settings(deadline=None, derandomize=True)
@@ -26,6 +34,71 @@ def test_what_the_solver_writes_holds(trace: Trace) -> None:
         assert bound.faults == ()
         if solution.cost is not None:  # boundary axioms leave some random traces without any map
             assert bound.dstates + len(bound.refuted) == solution.certificate.bound == solution.cost.dstates
+
+
+@pytest.mark.parametrize("length", [12, 120])
+def test_a_certificate_is_worked_out_when_asked_for(length: int) -> None:
+    """Of the prefix that clingo was given, once; whether the search, too, had need of steps that are apart, or not."""
+    trace = wandering(2, rooms=5, length=length, views=3)
+    search = Search(trace, Theory.causal(), maps=1)
+    solution = search.solution(tuple(search))
+    assert solution.evidence is not None
+    assert "certificate" not in vars(solution.evidence)
+    log = Log(trace, search.theory)
+    certificate = solution.certificate
+    assert certificate is not None
+    assert certificate.clique == tuple(
+        clique(apartness(log.seen[: solution.prefix], log.actions[: solution.prefix - 1]), log.seen[: solution.prefix])
+    )
+    assert solution.cost is not None
+    assert certificate.bound == solution.cost.dstates
+    assert solution.certificate is certificate
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_a_solution_travels_with_its_certificate(asked: bool) -> None:
+    trace = wandering(2, rooms=5, length=12, views=3)
+    solution = solve(trace, Theory.causal())
+    if asked:
+        assert solution.certificate is not None
+    copy = pickle.loads(pickle.dumps(solution))
+    assert copy == solution
+    assert hash(copy.evidence) == hash(solution.evidence)
+    assert copy.certificate == solution.certificate
+    assert replace(solution, prefix=0).certificate == solution.certificate
+    assert replace(solution, evidence=None) != solution
+    assert replace(solution, evidence=None).certificate is None
+
+
+def test_a_theory_without_what_it_rests_on_has_no_certificate() -> None:
+    trace = wandering(2, rooms=5, length=5, views=3)
+    solution = solve(trace, Theory.causal().replace(without=("deterministic",)))
+    assert (solution.evidence, solution.certificate) == (None, None)
+
+
+def test_a_mapper_gives_a_certificate() -> None:
+    mapper = OnlineMapper("a", Theory.causal())
+    for view in "bab":
+        mapper.observe("travel", view)
+    assert mapper.solution.certificate is not None
+    assert mapper.solution.certificate.bound == 2
+
+
+def test_evidence_without_views_has_what_was_found() -> None:
+    assert Evidence((), (), 4, (0, 7)).certificate.refuted == (2, 3)
+
+
+def test_a_short_trace_is_solved_without_numpy() -> None:
+    """It takes longer to load than all the rest."""
+    program = textwrap.dedent("""
+        import sys
+        from ssh_abduction import Trace, cli, solve
+        solution = solve(Trace.from_steps("aba", ["travel", "travel"]))
+        print("numpy" in sys.modules)
+        print(solution.certificate.clique, "numpy" in sys.modules)
+    """)
+    shown = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, check=True).stdout
+    assert shown.splitlines() == ["False", "(0, 1) True"]
 
 
 def certified() -> tuple[Trace, dict[str, Any]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from ssh_abduction.apart import RESTS_ON
+from ssh_abduction.certificate import RESTS_ON
 from ssh_abduction.checker import check
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.errors import MapError
