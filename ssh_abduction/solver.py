@@ -32,7 +32,7 @@ where fewest paths come first, once there is any map; where fewest dstates come 
 dstates in the minimal map, as every path holds the two ends of a travel, and a dstate is along one path (with all_on_paths a path may hold one dstate
 alone). Else the control is made again with more names, at most one for each leg of the prefix, which is enough for any map.
 
-*From below.* By (1) the minimum does not fall from prefix to prefix. So a longer prefix is first asked for a map that costs what was
+*From below.* By (1) the minimum does not fall from prefix to prefix. So a prefix of more than FEW_STEPS is first asked for a map that costs what was
 proved for a shorter one: that is quick where it exists, and then minimal without another proof.
 
 A map of the prefix that stops early is no answer; what its continuations are, the longer prefix says. The claim needs
@@ -61,7 +61,7 @@ from ssh_abduction.trace import Trace
 FIRST_PREFIX = 8  # steps; short enough that solving it costs next to nothing
 HELD_BACK = 1000  # maps kept until a prefix proves long enough; from there on they stream
 FIRST_PATHS = 8  # names for paths to begin with
-FEW_STEPS = 24  # a trace of so many is not worth names given beforehand
+FEW_STEPS = 24  # of a trace or a prefix; so many are solved sooner without names, a map made greedily, or a question from below
 ALL = Speedups()
 
 
@@ -295,7 +295,8 @@ class Search:
         self._watch.start()
         try:
             if self.status is not Status.OPTIMAL:
-                self._merge()
+                if len(self.trace) > FEW_STEPS:
+                    self._merge()
             elif not self.prefix:
                 self._engine.grow(min(len(self.trace), FIRST_PREFIX))
             if self.status is Status.OPTIMAL or self._find_cost():
@@ -416,6 +417,9 @@ class Search:
         """Where nothing was found in time: some map of the whole trace, made without a search."""
         if not self._speedups.greedy or self.theory.without:
             return
+        self._merge()
+        if self.best is not None:
+            return
         first, *rest = self.trace.steps
         for homing in (True, False):
             sketch = Sketch(first, self.theory, homing)
@@ -442,7 +446,8 @@ class Search:
 
     def _candidates(self) -> Iterator[Found]:
         """Maps of the prefix that end with a minimal one: one as cheap as was proved before, or else ever better ones."""
-        if self._lower is not None and not self._whole and self._speedups.from_below and isinstance(self._engine, StepEngine):
+        below = self._speedups.from_below and not self._whole and self.prefix > FEW_STEPS and isinstance(self._engine, StepEngine)
+        if self._lower is not None and below:
             yield from itertools.islice(self._engine.maps_of_cost(self._lower, 1), 1)
         yield from self._engine.improving_maps()
 

@@ -46,7 +46,8 @@ def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
     # The traces are shorter than the solver's first prefix: a shorter one makes it replay and extend.
     first_prefix = data.draw(st.sampled_from([1, 3, solver.FIRST_PREFIX]), label="first prefix")
     first_paths = data.draw(st.sampled_from([1, 2, solver.FIRST_PATHS]), label="first paths")
-    with patch.object(solver, "FIRST_PREFIX", first_prefix), patch.object(solver, "FIRST_PATHS", first_paths):
+    few_steps = data.draw(st.sampled_from([0, solver.FEW_STEPS]), label="few steps")
+    with patch.multiple(solver, FIRST_PREFIX=first_prefix, FIRST_PATHS=first_paths, FEW_STEPS=few_steps):
         agree(trace, theory)
 
 
