@@ -243,15 +243,14 @@ class StepEngine(Engine):
         began = time.perf_counter()
         control = self._control
         try:
-            if self.size == 0:
-                control.ground([("base", [])])
+            base: list[tuple[str, list[clingo.Symbol]]] = [] if self.size else [("base", [])]
             while self.size < size:
                 self._watch.check()
                 part = f"steps_from_{self.size}"
                 stop = min(size, self.size + (8 if self.size < 32 else 1))
                 control.add(part, [], facts.trace_facts(self._trace, self._theory, self.size, stop))
-                control.ground([(part, []), *(("step", facts.step_number(t)) for t in range(self.size, stop))])
-                self.size = stop
+                control.ground([*base, (part, []), *(("step", facts.step_number(t)) for t in range(self.size, stop))])
+                self.size, base = stop, []
             if self._asked != size - 1:
                 control.ground([("check", facts.step_number(size - 1))])
                 if self._asked is not None:

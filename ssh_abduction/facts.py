@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from itertools import pairwise
 
-from clingo import Function, Model, Number, String, Symbol
+from clingo import Function, Model, Number, String, Symbol, SymbolType
 
 from ssh_abduction.maps import DState, Path, SSHMap
 from ssh_abduction.theory import Theory
@@ -93,6 +94,12 @@ def _kind_fact(action: Action) -> str:
     return f"kind({_constant(action.name)},travel)." if action.kind == "travel" else f"turns({_constant(action.name)},{action.turn})."
 
 
+@lru_cache(maxsize=2**14)
+def _atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
+    """The name and the arguments of an atom of a map. Kept, as maps have most atoms in common, and each part is a call to clingo."""
+    return symbol.name, tuple(arg.number if arg.type is SymbolType.Number else _COURSE[arg.name] for arg in symbol.arguments)
+
+
 def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
     """The map that an answer set describes, for the steps it speaks of."""
     is_at: dict[int, int] = {}
@@ -101,20 +108,19 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
     heading: dict[int, int] = {}
     before: list[tuple[int, int, int]] = []
     excused: list[tuple[int, int]] = []
-    for symbol in model.symbols(shown=True):
-        name, args = symbol.name, symbol.arguments
+    for name, args in map(_atom, model.symbols(shown=True)):
         if name == "is":
-            is_at[args[0].number] = args[1].number
+            is_at[args[0]] = args[1]
         elif name == "at":
-            place[args[0].number] = args[1].number
+            place[args[0]] = args[1]
         elif name == "along":
-            course[args[0].number] = (args[1].number, _COURSE[args[2].name])
+            course[args[0]] = (args[1], args[2])
         elif name == "before":
-            before.append((args[0].number, args[1].number, args[2].number))
+            before.append((args[0], args[1], args[2]))
         elif name == "heading":
-            heading[args[0].number] = args[1].number
+            heading[args[0]] = args[1]
         elif name == "excused":
-            excused.append((args[0].number, args[1].number))
+            excused.append((args[0], args[1]))
     names = sorted(set(is_at.values()))
     dstate_of = {name: i for i, name in enumerate(names)}
     place_of = {name: i for i, name in enumerate(sorted({place[s] for s in names if s in place}))}

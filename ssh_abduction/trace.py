@@ -16,6 +16,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias
 
@@ -182,7 +183,7 @@ class Trace:
     def views(self) -> tuple[View | None, ...]:
         return tuple(step.view for step in self.steps)
 
-    @property
+    @cached_property
     def actions(self) -> tuple[Action, ...]:
         return tuple(step.action for step in self.steps if step.action is not None)
 
