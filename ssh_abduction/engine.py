@@ -186,9 +186,11 @@ class Engine:
         assumptions: Sequence[tuple[clingo.Symbol, bool]] = (),
         conflicts: int = -1,
         on_bound: Callable[[Sequence[int]], None] | None = None,
+        control: clingo.Control | None = None,
     ) -> Generator[Answer, None, bool]:
         """What clingo answers, read at once. Returns whether it came to an end, and not to the limit of conflicts."""
-        configuration: Any = self._control.configuration.solve
+        control = control or self._control
+        configuration: Any = control.configuration.solve
         configuration.opt_mode = mode
         configuration.models = models
         configuration.project = "project" if not mode.startswith("opt") else "no"
@@ -196,7 +198,7 @@ class Engine:
         began = time.perf_counter()
         with ExitStack() as stack:
             with _held_back_interrupts():
-                handle = stack.enter_context(self._control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound))
+                handle = stack.enter_context(control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound))
             try:
                 while True:
                     handle.resume()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 
 from clingo import Function, Model, Number, String, Symbol, SymbolType
 
+from ssh_abduction.chart import FramedChart
 from ssh_abduction.maps import DState, Path, SSHMap
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Trace
@@ -121,6 +122,19 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
             heading[args[0]] = args[1]
         elif name == "excused":
             excused.append((args[0], args[1]))
+    return _map(trace, is_at, place, course, heading, before, excused)
+
+
+def _map(
+    trace: Trace,
+    is_at: Mapping[int, int],
+    place: Mapping[int, int],
+    course: Mapping[int, tuple[int, int]],
+    heading: Mapping[int, int],
+    before: Iterable[tuple[int, int, int]],
+    excused: Iterable[tuple[int, int]] = (),
+) -> SSHMap:
+    """The map of these dstates, places, courses and headings of steps; dstates and places are named by the first step at them."""
     names = sorted(set(is_at.values()))
     dstate_of = {name: i for i, name in enumerate(names)}
     place_of = {name: i for i, name in enumerate(sorted({place[s] for s in names if s in place}))}
@@ -160,14 +174,14 @@ def name_facts(names: Iterable[tuple[int, int]], spares: Iterable[Sequence[int]]
     return "\n".join(facts)
 
 
-def batch_facts(batch: int, steps: Iterable[tuple[int, int, Sequence[int], int | None]], links: Iterable[tuple[int, int]]) -> str:
-    """Steps, each with its view, the names it can be at, and the step of that view before it; and links with their actions."""
+def batch_facts(batch: int, steps: Iterable[tuple[int, int, Sequence[int], int | None]], links: Iterable[tuple[int, int, int]]) -> str:
+    """Nodes, each with its view, the names it can be at, and the node of that view before it; and links with their actions."""
     facts = []
     for t, view, names, before in steps:
         facts.append(f"node({batch},{t},{view}).")
         facts += [f"may_be({t},{name})." for name in names]
         facts += [f"follows({before},{t})."] if before is not None and len(names) > 1 else []
-    facts += [f"link({batch},{t},{action})." for t, action in links]
+    facts += [f"link({batch},{t},{action},{u})." for t, action, u in links]
     return "\n".join(facts)
 
 
@@ -190,6 +204,81 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
             first.append(t)
     found = tuple(number[label] for label in labels)
     return SSHMap(found, tuple(DState(i, _view(trace, t)) for i, t in enumerate(first)), links_of(found, trace))
+
+
+def street_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
+    """What happened at the nodes of a chart, as facts for streets.lp."""
+    facts = [f"turned({s},{x},{-action})." for s, action, x in chart.links if action < 0]
+    facts += [f"travel({s},{x})." for s, _, x in chart.travels]
+    turns = zip(pairwise(chart.node_of), trace.actions, strict=False)
+    for s, x, turn in dict.fromkeys((s, x, action.turn) for (s, x), action in turns if action.turn):
+        facts.append(f"around({s},{x})." if turn == "around" else f"bend({s},{turn},{x}).")
+    facts += ["sided."] if theory.boundary != "none" else []
+    facts += ["symmetric."] if theory.symmetric_sides else []
+    return "\n".join(facts)
+
+
+def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int]) -> str:
+    """The dstate of each node, what is open from it, and what is preferred, as facts for the least streets."""
+    facts = [f"is({node},{label})." for node, label in enumerate(labels)]
+    for label, node in dict(zip(reversed(labels), range(len(labels) - 1, -1, -1), strict=True)).items():
+        visit, slot = chart.facing[node]
+        star = chart.stars[visit]
+        facts += [f"open({label},{k})." for k in range(4) if star[(slot + k) % 4]]
+    facts += [f"prefer({count},{len(theory.priorities) - i})." for i, count in enumerate(theory.priorities)]
+    return "\n".join(facts)
+
+
+def dstate_at(node: int, label: int) -> Symbol:
+    """The atom that puts a node at a dstate."""
+    return Function("is", [Number(node), Number(label)])
+
+
+def open_labels(labels: Sequence[int]) -> str:
+    """The dstate of each node, for clingo to take or leave, as long as nothing is violated."""
+    return "\n".join([*(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)), ":- violated."])
+
+
+def forbidden(placed: Sequence[tuple[int, int]]) -> str:
+    """The rule that these nodes are not all at these dstates."""
+    return f":- {', '.join(f'is({node},{label})' for node, label in placed)}."
+
+
+def read_streets(model: Model, trace: Trace, chart: FramedChart, labels: Sequence[int]) -> SSHMap:
+    """The map of the dstates that label the nodes, with the places and paths of an answer set of streets.lp."""
+    at: dict[int, tuple[int, int]] = {}
+    stands: dict[int, tuple[int, int]] = {}
+    part: dict[int, tuple[int, int]] = {}
+    runs: dict[int, tuple[int, int]] = {}
+    order: list[tuple[int, int, int]] = []
+    for name, args in map(_atom, model.symbols(shown=True)):
+        if name == "before":
+            order.append((args[0], args[1], args[2]))
+        else:
+            {"at": at, "stands": stands, "course": part, "runs": runs}[name][args[0]] = (args[1], args[2])
+    is_at: dict[int, int] = {}
+    place: dict[int, int] = {}
+    course: dict[int, tuple[int, int]] = {}
+    heading: dict[int, int] = {}
+    first: dict[int, int] = {}  # step at a dstate
+    arrived: dict[int, tuple[int, int]] = {}  # of each place, the first step there and the slot it faces
+    faced: dict[int, tuple[int, int]] = {}  # of each path, its number and the direction that was faced first
+    for t, node in enumerate(chart.node_of):
+        s = labels[node]
+        is_at[t] = first.setdefault(s, t)
+        if is_at[t] < t:
+            continue
+        component, slot = stands[s]
+        p, turned = at[component]
+        place[t], facing = arrived.setdefault(p, (t, (slot + turned) % 4))
+        heading[t] = (slot + turned - facing) % 4
+        if s in runs:
+            stretch, sign = runs[s]
+            path, direction = part[stretch]
+            number, ahead = faced.setdefault(path, (len(faced), sign * direction))
+            course[t] = (number, sign * direction * ahead)
+    before = [(faced[h][0], *((arrived[p][0], arrived[q][0]) if faced[h][1] == 1 else (arrived[q][0], arrived[p][0]))) for h, p, q in order]
+    return _map(trace, is_at, place, course, heading, before)
 
 
 def links_of(labels: Sequence[int], trace: Trace) -> tuple[tuple[int, str, int], ...]:

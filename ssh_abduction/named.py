@@ -18,13 +18,16 @@ answer soon, what is missing is rather more knowledge than less, and all links a
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from typing import TypeAlias
 
 import clingo
 import numpy as np
+from numpy.typing import NDArray
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.apart import apart_from, apartness, clique
+from ssh_abduction.apart import apart_from, clique
+from ssh_abduction.chart import Chart
 from ssh_abduction.engine import AT_ONCE, Engine, Found, Watch
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
@@ -35,6 +38,10 @@ FIRST_PREFIXES = 32  # steps of a prefix that is tried before that
 HELD_BACK = 100  # maps that are kept until all links are given; then they stream
 SPARES = 3  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
+
+
+Link: TypeAlias = tuple[int, int, int]  # node, action, node
+_Trail: TypeAlias = "tuple[Link, _Trail] | None"
 
 
 class NamedEngine(Engine):
@@ -62,28 +69,44 @@ class NamedEngine(Engine):
             return
         began = time.perf_counter()
         self.size = size
-        seen = self._log.seen[:size]
-        actions = self._log.actions[: size - 1]
-        apart = apartness(seen[:AT_ONCE], actions[: AT_ONCE - 1])
+        self._chart = self._charted(size)
+        seen = self._chart.seen
+        apart = self._chart.apart(AT_ONCE)
         self._watch.check()
         self.clique = clique(apart, seen[:AT_ONCE]) if self._speedups.clique else [0]
-        pinned = {step: name for name, step in enumerate(self.clique)}
-        columns = apart[:, self.clique] if size <= AT_ONCE else np.stack([apart_from(seen, actions, t) for t in self.clique], axis=1)
+        pinned = {node: name for name, node in enumerate(self.clique)}
+        columns = apart[:, self.clique] if len(seen) <= AT_ONCE else self._columns(self.clique)
         self._may_be = [[pinned[t]] if t in pinned else (~row).nonzero()[0].tolist() for t, row in enumerate(columns)]
         self._spares = dict.fromkeys(seen, SPARES)
-        self._links = dict.fromkeys(range(size - 1))
+        self._links = dict.fromkeys(self._chart.links)
         if self._speedups.lazy:
-            self._links = dict.fromkeys(t for t in [0, *self.clique] if t < size - 1)
+            first = {0, *self.clique}
+            self._links = dict.fromkeys(link for link in self._chart.links if link[0] in first)
         self.bound = max(self.bound or 0, len(self.clique))
         self.ground_seconds += time.perf_counter() - began
         self._restart()
 
+    def _charted(self, size: int) -> Chart:
+        """The nodes that the first steps are."""
+        return Chart.of_steps(self._log, size)
+
+    def _columns(self, nodes: Sequence[int]) -> NDArray[np.bool_]:
+        """The columns of these nodes in the matrix of apart nodes, where that is too large."""
+        return np.stack([apart_from(self._chart.seen, self._log.actions[: self.size - 1], t) for t in nodes], axis=1)
+
     def improving_maps(self) -> Iterator[Found]:
-        if self.size == 1:
-            yield self._found((0,))
-            return
+        yield self._found(self._minimal_labels())
+
+    def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
+        for labels in self._labels_of(cost[0], enough):
+            yield self._found(labels)
+
+    def _minimal_labels(self) -> list[int]:
+        """Names for all nodes that need the fewest dstates."""
+        if not self._chart.links:
+            return [0]
         while True:
-            lazy = len(self._links) < self.size - 1
+            lazy = len(self._links) < len(self._chart.links)
             answer = None
             answers = self._answers(facts.read_names, "opt", 0, conflicts=PATIENCE if lazy else -1, on_bound=self._raise_bound)
             while True:
@@ -93,34 +116,34 @@ class NamedEngine(Engine):
                     proven = end.value
                     break
             if not proven or answer is None:
-                self._add(range(self.size - 1))
+                self._add(self._chart.links)
             elif not self._widened(answer):
                 self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
                 labels, failed = self._follow(answer)
                 if not failed:
-                    yield self._found(labels)
-                    return
+                    return labels
                 self._add(failed)
 
-    def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        if self.size == 1:
-            yield self._found((0,))
-            return
-        spares = cost[0] - len(self.clique)
+    def _labels_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
+        """All ways to name the nodes with so many dstates; or `enough` of them, unless that is 0."""
+        spares = dstates - len(self.clique)
         if spares < 0:
+            return
+        if not self._chart.links:
+            yield [0]
             return
         if not enough:
             while self._needs_rest(spares):
                 pass
         while True:
-            held: list[Found] = []
-            failed: Iterable[int] = ()
-            lazy = len(self._links) < self.size - 1
+            held: list[list[int]] = []
+            failed: Iterable[Link] = ()
+            lazy = len(self._links) < len(self._chart.links)
             for answer in self._answers(facts.read_names, f"enum,{spares},0", 0):
                 labels, failed = self._follow(answer)
                 if failed:
                     break
-                held.append(self._found(labels))
+                held.append(labels)
                 if enough:
                     if len(held) == enough:
                         yield from held
@@ -128,7 +151,7 @@ class NamedEngine(Engine):
                 elif not lazy:
                     yield held.pop()
                 elif len(held) == HELD_BACK:
-                    failed = range(self.size - 1)
+                    failed = self._chart.links
                     break
             if failed:
                 self._add(failed)
@@ -152,22 +175,19 @@ class NamedEngine(Engine):
     def _restart(self) -> None:
         """Take a new control, for other names."""
         began = time.perf_counter()
-        names = [(name, self._log.seen[step]) for name, step in enumerate(self.clique)]
-        spares: dict[int, list[int]] = {}
+        seen = self._chart.seen
+        names = [(name, seen[node]) for name, node in enumerate(self.clique)]
+        spares = self._spare = dict[int, list[int]]()
         for view, count in self._spares.items():
             spares[view] = list(range(len(names), len(names) + count + 1))
             names += [(name, view) for name in spares[view]]
         self._rest = {found[-1]: view for view, found in spares.items()}
         self._choices = [
-            options if len(options) == 1 and t == self.clique[options[0]] else options + spares[self._log.seen[t]]
+            options if len(options) == 1 and t == self.clique[options[0]] else options + spares[seen[t]]
             for t, options in enumerate(self._may_be)
         ]
         leads = {
-            (s, action, x)
-            for t, action in enumerate(self._log.actions[: self.size - 1])
-            for s in self._choices[t]
-            if s not in self._rest
-            for x in self._choices[t + 1]
+            (s, action, x) for t, action, u in self._chart.links for s in self._choices[t] if s not in self._rest for x in self._choices[u]
         }
         self._control = clingo.Control(["--warn=none", *(["--opt-strategy=usc"] if self._speedups.core_guided else [])])
         self._control.load(encodings.path("names"))
@@ -180,22 +200,22 @@ class NamedEngine(Engine):
         links, self._links = self._links, {}
         self._add(links)
 
-    def _add(self, links: Iterable[int]) -> None:
-        """Give clingo these links, and the steps at their ends."""
+    def _add(self, links: Iterable[Link]) -> None:
+        """Give clingo these links, and the nodes at their ends."""
         self._watch.check()
         began = time.perf_counter()
-        added = [t for t in links if t not in self._links]
+        added = [link for link in links if link not in self._links]
         given = []
-        for t in (t for link in added for t in (link, link + 1)):
+        for t in (end for s, _, x in added for end in (s, x)):
             if t not in self._given:
                 self._given.add(t)
-                view = self._log.seen[t]
+                view = self._chart.seen[t]
                 given.append((t, view, self._choices[t], self._last.get(view)))
                 if len(self._choices[t]) > 1:
                     self._last[view] = t
         self._links.update(dict.fromkeys(added))
         part, batch = f"batch_{self._batches}", self._batches
-        self._control.add(part, [], facts.batch_facts(batch, given, [(t, self._log.actions[t]) for t in added]))
+        self._control.add(part, [], facts.batch_facts(batch, given, added))
         self._control.ground([(part, [])])
         self._control.ground([("more", facts.step_number(batch))])
         self._batches += 1
@@ -210,29 +230,38 @@ class NamedEngine(Engine):
             self._restart()
         return bool(used)
 
-    def _follow(self, answer: dict[int, int]) -> tuple[list[int], list[int]]:
-        """The name of every step, following the answer's links from step to step, and the links that it does not explain."""
-        actions = self._log.actions
-        goes: dict[tuple[int, int], int | None] = {(answer[t], actions[t]): answer[t + 1] for t in self._links}
-        labels = [answer[0]]
-        failed: list[int] = []
-        followed: list[int] = []  # links since the last step that clingo labelled
-        here: int | None = answer[0]
-        for t in range(self.size - 1):
+    def _follow(self, answer: dict[int, int]) -> tuple[list[int], list[Link]]:
+        """The name of every node, following the answer's links from node to node, and the links that it does not explain."""
+        goes: dict[tuple[int, int], int] = {(answer[t], action): answer[u] for t, action, u in self._links}
+        labels = [-1] * len(self._chart.seen)  # -1: not known
+        followed: list[_Trail] = [None] * len(labels)  # links since the last node that clingo named
+        failed: dict[Link, None] = {}
+        asked: set[tuple[int, int]] = set()  # one such link is asked for, not all
+        labels[0] = answer[0]
+        for link in self._chart.links:
+            t, action, u = link
+            here, key = labels[t], (labels[t], action)
             there = None
-            if here is not None:
-                followed.append(t)
-                key = (here, actions[t])
-                if key not in goes:
-                    failed.append(t)
-                    goes[key] = None  # ask for one such link, not for all
-                there = goes[key]
-                if there is not None and (there not in self._choices[t + 1] or answer.get(t + 1, there) != there):
-                    failed += [link for link in followed if link not in self._links]
-                    there = None
-            if there is None or t + 1 in answer:
-                followed = []
-                there = answer.get(t + 1)
-            here = there
-            labels.append(-1 if here is None else here)
-        return labels, failed
+            if t < u and labels[u] < 0:
+                if here >= 0 and key not in asked:
+                    trail = (link, followed[t])
+                    if key not in goes:
+                        failed[link] = None
+                        asked.add(key)
+                    elif goes[key] not in self._choices[u] or answer.get(u, goes[key]) != goes[key]:
+                        failed.update(self._not_given(trail))
+                    else:
+                        there = goes[key]
+                        followed[u] = None if u in answer else trail
+                labels[u] = answer.get(u, -1) if there is None else there
+            elif here >= 0 and labels[u] >= 0 and goes.setdefault(key, labels[u]) != labels[u]:
+                failed.update(self._not_given((link, followed[t])))
+                failed.update(self._not_given(followed[u]))
+        return labels, list(failed)
+
+    def _not_given(self, trail: _Trail) -> Iterator[tuple[Link, None]]:
+        """The links on a trail that clingo does not know."""
+        while trail is not None:
+            link, trail = trail
+            if link not in self._links:
+                yield link, None

@@ -65,6 +65,17 @@ FEW_STEPS = 24  # of a trace or a prefix; so many are solved sooner without name
 ALL = Speedups()
 
 
+def has_frames(theory: Theory) -> bool:
+    """Whether framed.py knows the axioms of a theory, and its preference."""
+    return (
+        theory.star == "frame"
+        and theory.priorities[:1] == ("dstates",)
+        and theory.boundary in ("none", "strict")
+        and theory.path_order == "total"
+        and not (theory.next_place or theory.all_on_paths or theory.without)
+    )
+
+
 class Status(Enum):
     """What is known about the trace."""
 
@@ -267,14 +278,16 @@ class Search:
         """Whether the theory lets dstates have names beforehand, and the trace is long enough for that to pay."""
         theory = self.theory
         causal = theory.level == "causal" and theory.prefer == ("dstates",) and not theory.without
-        return causal and self._speedups.names and len(self.trace) > FEW_STEPS
+        return (causal or has_frames(theory)) and self._speedups.names and len(self.trace) > FEW_STEPS
 
     def _new_engine(self) -> Engine:
         theory = self.theory
-        if self._names_pay():
-            from ssh_abduction.named import NamedEngine  # loads numpy, which takes longer than to solve a short trace
+        if self._names_pay():  # loads numpy, which takes longer than to solve a short trace
+            from ssh_abduction.framed import FramedEngine
+            from ssh_abduction.named import NamedEngine
 
-            return NamedEngine(self.trace, theory, self._watch, self._log, self._speedups)
+            engine = NamedEngine if theory.level == "causal" else FramedEngine
+            return engine(self.trace, theory, self._watch, self._log, self._speedups)
         most = facts.most_paths(self.trace, theory, len(self.trace))
         return StepEngine(self.trace, theory, self._watch, min(FIRST_PATHS, most) if self._speedups.path_names else most)
 

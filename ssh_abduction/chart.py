@@ -1,0 +1,148 @@
+"""What the steps of a trace are to a solver that names dstates beforehand: nodes, the links between them, and which nodes are apart.
+
+To the causal theory each step is a node, and each action a link to the next. In a theory where places have frames (star=frame), a turn
+rotates by known quarters: so the steps between two travels, a *visit*, are at one place, and those of a visit that face the same way are
+one node, linked by rotations both ways. Nodes are apart if that follows from what was seen and done, as in `apart.py`.
+
+>>> from ssh_abduction import Theory, Trace
+>>> from ssh_abduction.chart import Chart
+>>> from ssh_abduction.replay import Log
+>>> star = [0, 0, 1, 0], [1, 0, 0, 0]
+>>> trace = Trace.from_steps(["a", "b", "a"], ["around", "around"], stars=[star[0], star[1], star[0]])
+>>> chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
+>>> chart.node_of, chart.links
+((0, 1, 0), ((0, -2, 1), (1, -2, 0)))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from ssh_abduction.replay import Log
+from ssh_abduction.trace import Trace
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+QUARTERS = {"right": 1, "around": 2, "left": 3}
+
+
+class NoFrame(Exception):  # noqa: N818 - not an error
+    """Some visit does not fit a frame: the theory has no map of the trace."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Nodes, numbered by the first step at them, and links.
+
+    seen     the observation at each node
+    links    node, action, node. A rotation by J quarters is the action -J
+    node_of  the node of each step
+    """
+
+    seen: tuple[int, ...]
+    links: tuple[tuple[int, int, int], ...]
+    node_of: Sequence[int]
+
+    @staticmethod
+    def of_steps(log: Log, size: int) -> Chart:
+        """The chart of the first steps, each a node."""
+        return Chart(tuple(log.seen[:size]), tuple((t, log.actions[t], t + 1) for t in range(size - 1)), range(size))
+
+    def apart(self, most: int) -> NDArray[np.bool_]:
+        """Which pairs of the first nodes, `most` at most, are apart."""
+        from ssh_abduction.apart import apartness  # loads numpy
+
+        seen = self.seen[:most]
+        return apartness(seen, [action for _, action, _ in self.links[: len(seen) - 1]])
+
+    @staticmethod
+    def framed(trace: Trace, log: Log, size: int | None = None) -> FramedChart:
+        """The chart of the first steps (default all), where places have frames. Raises NoFrame."""
+        size = len(trace) if size is None else size
+        node: dict[tuple[int, int], int] = {}
+        seen: list[int] = []
+        node_of: list[int] = []
+        stars: list[tuple[int, ...]] = []  # of each visit, in a frame whose slot 0 the robot faces as it arrives
+        travels: list[tuple[int, int, int]] = []
+        visit = slot = 0
+        for t in range(size):
+            if t and (action := trace.actions[t - 1]).kind == "travel":
+                visit, slot = visit + 1, 0
+            elif t:
+                slot = (slot + QUARTERS[action.turn or ""]) % 4
+            openings = trace.steps[t].openings or ()
+            star = tuple(int(openings[(k - slot) % 4]) for k in range(4))
+            if visit == len(stars):
+                stars.append(star)
+            if (here := node.setdefault((visit, slot), len(seen))) == len(seen):
+                seen.append(log.seen[t])
+            if seen[here] != log.seen[t] or stars[visit] != star:
+                raise NoFrame
+            node_of.append(here)
+            if t and action.kind == "travel":
+                travels.append((node_of[-2], log.actions[t - 1], here))
+        rotations = [
+            (s, -((k - j) % 4), x) for (v, j), s in node.items() for k in range(4) if k != j and (x := node.get((v, k))) is not None
+        ]
+        links = sorted([*travels, *rotations], key=lambda link: max(link[0], link[2]))
+        return FramedChart(tuple(seen), tuple(links), tuple(node_of), tuple(node), tuple(stars), tuple(travels))
+
+
+@dataclass(frozen=True)
+class FramedChart(Chart):
+    """A chart of visits.
+
+    facing   visit and slot of each node; a slot counts quarters clockwise from how the robot faced as it arrived
+    stars    the openings seen on each visit, by slot
+    travels  the links that are travels, in order: the visit's number is that of the travel after it
+    """
+
+    facing: tuple[tuple[int, int], ...]
+    stars: tuple[tuple[int, ...], ...]
+    travels: tuple[tuple[int, int, int], ...]
+
+    def apart(self, most: int) -> NDArray[np.bool_]:
+        """Which pairs of the first nodes are apart: no frame has both visits so turned that the two nodes are one dstate.
+
+        As in `apartness`, from the last visit to the first: visits do not fit if they show different things, or if the same action,
+        done facing the same way, leads to visits that do not fit as they are.
+        """
+        import numpy as np
+
+        visits, slots = np.asarray(self.facing[:most]).T
+        rotated = (slots[None, :] - slots[:, None]) % 4
+        apart: NDArray[np.bool_] = self._misfits[rotated, visits[:, None], visits[None, :]]
+        apart |= (visits[:, None] == visits[None, :]) & (rotated != 0)
+        return apart
+
+    @cached_property
+    def _misfits(self) -> NDArray[np.bool_]:
+        """quarters x visits x visits: slot 0 of the first visit cannot be the slot of that number of the second."""
+        import numpy as np
+
+        visits = len(self.stars)
+        views = np.full((visits, 4), -1)
+        for (visit, slot), seen in zip(self.facing, self.seen, strict=True):
+            views[visit, slot] = seen
+        stars = np.asarray(self.stars)
+        leaves = np.full(visits, -1)  # the slot that a visit ends at, none for the last
+        action = np.full(visits, -1)
+        for visit, (s, a, _) in enumerate(self.travels):
+            leaves[visit], action[visit] = self.facing[s][1], a
+        misfits = np.zeros((4, visits, visits), dtype=bool)
+        for i in range(visits - 1, -1, -1):
+            for r in range(4):
+                row = misfits[r, i]
+                for slot in range(4):
+                    there = (slot + r) % 4
+                    row |= stars[:, there] != stars[i, slot]
+                    row |= (views[i, slot] >= 0) & (views[:, there] >= 0) & (views[:, there] != views[i, slot])
+                if i < visits - 1:
+                    alike = ((leaves[i] + r) % 4 == leaves) & (action == action[i])
+                    row[:-1] |= alike[:-1] & misfits[0, i + 1, 1:]
+        return misfits
