@@ -34,6 +34,16 @@ def apartness(seen: Sequence[int], actions: Sequence[int]) -> Matrix:
     return apart
 
 
+def far_apart(apart: Matrix, seen: Sequence[int], actions: Sequence[int]) -> Matrix:
+    """The matrix, changed in place, of the pairs that are apart though they show the same view, and no other after one action."""
+    shown, done = np.asarray(seen), np.asarray(actions)
+    for t in range(len(shown)):
+        apart[t] &= shown == shown[t]
+        if t < len(done):
+            apart[t, :-1] &= (done != done[t]) | (shown[1:] == shown[t + 1])
+    return apart
+
+
 def apart_from(seen: Sequence[int], actions: Sequence[int], step: int) -> Matrix:
     """Which steps are apart from this one: a column of the matrix without the matrix, for traces too long for that."""
     shown, done = np.asarray(seen), np.asarray(actions)

@@ -60,6 +60,12 @@ class Chart:
         seen = self.seen[:most]
         return apartness(seen, [action for _, action, _ in self.links[: len(seen) - 1]])
 
+    def far_apart(self, apart: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+        """The pairs of the matrix of all nodes of which names.lp should be told, if any: more than one action shows that they are apart."""
+        from ssh_abduction.apart import far_apart
+
+        return far_apart(apart, self.seen, [action for _, action, _ in self.links])
+
     @staticmethod
     def framed(trace: Trace, log: Log, size: int | None = None) -> FramedChart:
         """The chart of the first steps (default all), where places have frames. Raises NoFrame."""
@@ -119,6 +125,9 @@ class FramedChart(Chart):
         apart: NDArray[np.bool_] = self._misfits[rotated, visits[:, None], visits[None, :]]
         apart |= (visits[:, None] == visits[None, :]) & (rotated != 0)
         return apart
+
+    def far_apart(self, apart: NDArray[np.bool_]) -> None:
+        """None: a visit knows so much that the links are enough."""
 
     @cached_property
     def _misfits(self) -> NDArray[np.bool_]:

@@ -174,14 +174,20 @@ def name_facts(names: Iterable[tuple[int, int]], spares: Iterable[Sequence[int]]
     return "\n".join(facts)
 
 
-def batch_facts(batch: int, steps: Iterable[tuple[int, int, Sequence[int], int | None]], links: Iterable[tuple[int, int, int]]) -> str:
-    """Nodes, each with its view, the names it can be at, and the node of that view before it; and links with their actions."""
+def batch_facts(
+    batch: int,
+    nodes: Iterable[tuple[int, int, Sequence[int], int | None]],
+    links: Iterable[tuple[int, int, int]],
+    apart: Iterable[tuple[int, int]],
+) -> str:
+    """Nodes, each with its view, the names it can be at, and the node of that view before it; links with their actions; and pairs that are apart."""
     facts = []
-    for t, view, names, before in steps:
+    for t, view, names, before in nodes:
         facts.append(f"node({batch},{t},{view}).")
         facts += [f"may_be({t},{name})." for name in names]
         facts += [f"follows({before},{t})."] if before is not None and len(names) > 1 else []
     facts += [f"link({batch},{t},{action},{u})." for t, action, u in links]
+    facts += [f"apart({batch},{t},{u})." for t, u in apart]
     return "\n".join(facts)
 
 

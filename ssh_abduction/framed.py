@@ -137,6 +137,7 @@ class FramedEngine(NamedEngine):
 
     def _forbid(self, labels: Sequence[int]) -> None:
         """Tell clingo which of these labels do not go together."""
+        self._end_begun()
         clashes = [tuple((node, self._stable(labels[node])) for node in nodes) for nodes in self._clashing(labels)]
         self._clashes += clashes
         nodes = {node for clash in clashes for node, _ in clash}

@@ -12,7 +12,14 @@ reaches it. ∎ A minimal answer that does use a rest is asked for again, with o
 
 Not every step is needed. The control starts with the links of the pinned steps; an answer is followed along the trace, and the links
 at which it fails are added, until one holds everywhere. That is a relaxation until then, so its bounds hold. Where clingo does not
-answer soon, what is missing is rather more knowledge than less, and all links are given at once.
+answer soon, what is missing is rather more knowledge than less, and all links are given at once. Then it is also told which pairs
+of steps are apart, where more than one action shows it: no two of them are at one name. The links say so, too, but only once it is
+chosen where they lead.
+
+Raising the bound by cores stalls when what is missing can be spread over many views: every core is then about all of them. After
+CORES conflicts the numbers of dstates are asked for one by one instead, from the bound up: is there an answer that costs no more? If
+there is none, the bound is one higher. The first answer without a rest is a minimal map, as it costs what the bound is; the same
+search then goes on with the other maps.
 """
 
 from __future__ import annotations
@@ -38,6 +45,8 @@ FIRST_PREFIXES = 32  # steps of a prefix that is tried before that
 HELD_BACK = 100  # maps that are kept until all links are given; then they stream
 SPARES = 3  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
+CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
+FEW_SPARES = 2  # spare names of a view for that, where SPARES were enough: fewer choices, and clingo answers sooner
 
 
 Link: TypeAlias = tuple[int, int, int]  # node, action, node
@@ -51,6 +60,8 @@ class NamedEngine(Engine):
         super().__init__(trace, theory, watch)
         self._log = log
         self._speedups = speedups
+        self._one_by_one = False
+        self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
 
     def with_paths(self, paths: int) -> NamedEngine:
         return NamedEngine(self._trace, self._theory, self._watch, self._log, self._speedups)
@@ -77,6 +88,8 @@ class NamedEngine(Engine):
         pinned = {node: name for name, node in enumerate(self.clique)}
         columns = apart[:, self.clique] if len(seen) <= AT_ONCE else self._columns(self.clique)
         self._may_be = [[pinned[t]] if t in pinned else (~row).nonzero()[0].tolist() for t, row in enumerate(columns)]
+        self._far = self._chart.far_apart(apart) if self._speedups.apart and len(seen) <= AT_ONCE else None
+        self._one_by_one = False
         self._spares = dict.fromkeys(seen, SPARES)
         self._links = dict.fromkeys(self._chart.links)
         if self._speedups.lazy:
@@ -105,10 +118,11 @@ class NamedEngine(Engine):
         """Names for all nodes that need the fewest dstates."""
         if not self._chart.links:
             return [0]
-        while True:
+        while not self._one_by_one:
             lazy = len(self._links) < len(self._chart.links)
             answer = None
-            answers = self._answers(facts.read_names, "opt", 0, conflicts=PATIENCE if lazy else -1, on_bound=self._raise_bound)
+            most = PATIENCE if lazy else CORES if self._speedups.one_by_one else -1
+            answers = self._answers(facts.read_names, "opt", 0, conflicts=most, on_bound=self._raise_bound)
             while True:
                 try:
                     answer = next(answers)
@@ -116,6 +130,8 @@ class NamedEngine(Engine):
                     proven = end.value
                     break
             if not proven or answer is None:
+                if not lazy:
+                    self._ask_one_by_one()
                 self._add(self._chart.links)
             elif not self._widened(answer):
                 self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
@@ -123,6 +139,42 @@ class NamedEngine(Engine):
                 if not failed:
                     return labels
                 self._add(failed)
+        return self._follow(self._first_of_bound())[0]
+
+    def _ask_one_by_one(self) -> None:
+        self._one_by_one = True
+        self._spares = {view: FEW_SPARES if count == SPARES else count for view, count in self._spares.items()}
+        self._restart()
+
+    def _first_of_bound(self) -> dict[int, int]:
+        """Raise the bound until there is a map that costs no more. All links are given."""
+        while True:
+            spares = (self.bound or 0) - len(self.clique)
+            answers = self._answers(facts.read_names, f"enum,{spares},{spares}", 0)
+            answer = next(answers, None)
+            if answer is None:
+                self._raise_bound([spares + 1])
+            elif self._rests(answer):
+                answers.close()
+                self._widened(answer)
+            else:
+                self._begun = answers
+                self._first = answer
+                return answer
+
+    def _all_of_bound(self, spares: int) -> Iterator[dict[int, int]]:
+        """All answers of this cost that use no rest, where a search for them has begun from there on."""
+        if self._begun is None:
+            yield from self._answers(facts.read_names, f"enum,{spares},0", 0)
+            return
+        begun, self._begun = self._begun, None
+        yield self._first
+        yield from (answer for answer in begun if not self._rests(answer))
+
+    def _end_begun(self) -> None:
+        if self._begun is not None:
+            self._begun.close()
+            self._begun = None
 
     def _labels_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
         """All ways to name the nodes with so many dstates; or `enough` of them, unless that is 0."""
@@ -132,6 +184,8 @@ class NamedEngine(Engine):
         if not self._chart.links:
             yield [0]
             return
+        if not enough or self.bound != dstates:
+            self._end_begun()
         if not enough:
             while self._needs_rest(spares):
                 pass
@@ -139,7 +193,7 @@ class NamedEngine(Engine):
             held: list[list[int]] = []
             failed: Iterable[Link] = ()
             lazy = len(self._links) < len(self._chart.links)
-            for answer in self._answers(facts.read_names, f"enum,{spares},0", 0):
+            for answer in self._all_of_bound(spares):
                 labels, failed = self._follow(answer)
                 if failed:
                     break
@@ -175,6 +229,7 @@ class NamedEngine(Engine):
     def _restart(self) -> None:
         """Take a new control, for other names."""
         began = time.perf_counter()
+        self._end_begun()
         seen = self._chart.seen
         names = [(name, seen[node]) for name, node in enumerate(self.clique)]
         spares = self._spare = dict[int, list[int]]()
@@ -189,11 +244,13 @@ class NamedEngine(Engine):
         leads = {
             (s, action, x) for t, action, u in self._chart.links for s in self._choices[t] if s not in self._rest for x in self._choices[u]
         }
-        self._control = clingo.Control(["--warn=none", *(["--opt-strategy=usc"] if self._speedups.core_guided else [])])
+        cores = ["--opt-strategy=usc"] if self._speedups.core_guided else []
+        self._control = clingo.Control(["--warn=none", *(["--configuration=handy"] if self._one_by_one else cores)])
         self._control.load(encodings.path("names"))
         self._control.add("base", [], facts.name_facts(names, spares.values(), leads))
         self._control.ground([("base", [])])
-        self._given: set[int] = set()  # steps
+        self._given: set[int] = set()  # nodes
+        self._open = np.zeros(len(seen), dtype=bool)  # whether a node is one of them, and not pinned
         self._last: dict[int, int] = {}  # by view, the step given last
         self._batches = 0
         self.ground_seconds += time.perf_counter() - began
@@ -205,7 +262,8 @@ class NamedEngine(Engine):
         self._watch.check()
         began = time.perf_counter()
         added = [link for link in links if link not in self._links]
-        given = []
+        given: list[tuple[int, int, Sequence[int], int | None]] = []
+        far: list[tuple[int, int]] = []
         for t in (end for s, _, x in added for end in (s, x)):
             if t not in self._given:
                 self._given.add(t)
@@ -213,9 +271,11 @@ class NamedEngine(Engine):
                 given.append((t, view, self._choices[t], self._last.get(view)))
                 if len(self._choices[t]) > 1:
                     self._last[view] = t
+                    far += [(t, int(u)) for u in np.flatnonzero(self._far[t] & self._open)] if self._far is not None else []
+                    self._open[t] = True
         self._links.update(dict.fromkeys(added))
         part, batch = f"batch_{self._batches}", self._batches
-        self._control.add(part, [], facts.batch_facts(batch, given, added))
+        self._control.add(part, [], facts.batch_facts(batch, given, added, far))
         self._control.ground([(part, [])])
         self._control.ground([("more", facts.step_number(batch))])
         self._batches += 1
@@ -223,12 +283,16 @@ class NamedEngine(Engine):
 
     def _widened(self, answer: dict[int, int]) -> bool:
         """Take more spare names for the views of which the answer uses the rest. Says whether there were any."""
-        used = {self._rest[name] for name in answer.values() if name in self._rest}
+        used = self._rests(answer)
         for view in used:
             self._spares[view] += 1
         if used:
             self._restart()
         return bool(used)
+
+    def _rests(self, answer: dict[int, int]) -> set[int]:
+        """The views of which the answer uses the rest."""
+        return {self._rest[name] for name in answer.values() if name in self._rest}
 
     def _follow(self, answer: dict[int, int]) -> tuple[list[int], list[Link]]:
         """The name of every node, following the answer's links from node to node, and the links that it does not explain."""

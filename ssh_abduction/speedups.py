@@ -17,8 +17,10 @@ class Speedups:
     from_below   ask a longer prefix first for a map that costs what was proved for a shorter one
     names        causal theory: give the dstates names beforehand
     clique       with names: pin steps that are pairwise apart
+    apart        with names: say which steps are apart, where more than one action shows it
     lazy         with names: give clingo only the links that replaying contradicts
     core_guided  with names: raise the bound from below, rather than better the map
+    one_by_one   with names: where that stalls, ask for numbers of dstates one by one
     greedy       some map without a search, for a time limit that leaves no other
     """
 
@@ -27,8 +29,10 @@ class Speedups:
     from_below: bool = True
     names: bool = True
     clique: bool = True
+    apart: bool = True
     lazy: bool = True
     core_guided: bool = True
+    one_by_one: bool = True
     greedy: bool = True
 
     @classmethod

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from itertools import product
 from unittest.mock import patch
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from instances import moore
 from strategies import traces
 
 from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, named, solve, solver
-from ssh_abduction.apart import apart_from, apartness, clique
+from ssh_abduction.apart import apart_from, apartness, clique, far_apart
 from ssh_abduction.checker import check
 from ssh_abduction.replay import Log
 
@@ -44,8 +46,11 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trac
     at_once = data.draw(st.sampled_from([4, 8000]), label="at once")
     patience = data.draw(st.sampled_from([0, 1, 2000]), label="patience")
     held = data.draw(st.sampled_from([1, 100]), label="held back")
+    cores = data.draw(st.sampled_from([0, 1, 10_000]), label="cores")
+    spares, few = data.draw(st.sampled_from([(0, 0), (1, 0), (3, 2)]), label="spare names")
     settings = patch.multiple(named, FIRST_PREFIXES=first, AT_ONCE=at_once, PATIENCE=patience, HELD_BACK=held)
-    with settings, patch.object(solver, "FEW_STEPS", 0):
+    fewer = patch.multiple(named, CORES=cores, SPARES=spares, FEW_SPARES=few)
+    with settings, fewer, patch.object(solver, "FEW_STEPS", 0):
         found = solve(trace, Theory.causal(), maps=0, speedups=Speedups.without(off))
     assert found.status is expected.status is Status.OPTIMAL
     assert found.cost == expected.cost
@@ -64,6 +69,34 @@ def test_each_speedup_off_alone(off: str, theory: Theory) -> None:
         found, expected = solve(trace, theory, maps=0, speedups=Speedups.without(off)), solve(trace, theory, maps=0)
     assert set(found.maps) == set(expected.maps)
     assert found.cost == expected.cost
+
+
+@pytest.mark.parametrize("off", ["", "clique", "apart"])
+@pytest.mark.parametrize("spares", [0, 2])
+@pytest.mark.parametrize("seed", range(8))
+def test_numbers_of_dstates_asked_for_one_by_one(seed: int, spares: int, off: str) -> None:
+    """From the clique up, or from one dstate, with names so few that answers use the rest: the minimum, and its maps."""
+    trace = moore(6, 2, steps=40, seed=seed).trace
+    grow = named.NamedEngine.grow
+
+    def grow_and_ask(engine: named.NamedEngine, size: int) -> None:
+        """Such short traces are solved before there are enough conflicts."""
+        if size != engine.size:
+            grow(engine, size)
+            engine._add(engine._chart.links)
+            engine._ask_one_by_one()
+
+    every = solve(trace, Theory.causal(), maps=0, speedups=Speedups.without("names"))
+    few = patch.multiple(named, SPARES=spares, FEW_SPARES=spares, FIRST_PREFIXES=len(trace))
+    with few, patch.object(named.NamedEngine, "grow", grow_and_ask):
+        found = solve(trace, Theory.causal(), maps=0, limit=30, speedups=Speedups.without(off))
+        some = solve(trace, Theory.causal(), maps=3, limit=30, speedups=Speedups.without(off))
+    assert found.status is some.status is Status.OPTIMAL
+    assert found.bound == every.bound == some.bound
+    assert set(found.maps) == set(every.maps)
+    assert found.count == every.count
+    assert set(some.maps) <= set(every.maps)
+    assert some.count == len(set(some.maps)) == min(3, every.count)
 
 
 @pytest.mark.parametrize("most", [1, 2, 5])
@@ -101,6 +134,11 @@ def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
                 k += 1
             assert apart[i, j] == (log.seen[i + k] != log.seen[j + k])
         assert apart_from(log.seen, log.actions, i).tolist() == apart[i].tolist()
+    far = far_apart(apart.copy(), log.seen, log.actions)
+    shown = [(log.seen[t], dict([(log.actions[t], log.seen[t + 1])] if t + 1 < len(trace) else [])) for t in range(len(trace))]
+    for (i, (view, follows)), (j, (other, leads)) in product(enumerate(shown), repeat=2):
+        near = view != other or any(follows[action] != leads[action] for action in follows.keys() & leads.keys())
+        assert far[i, j] == (apart[i, j] and not near)
     steps = clique(apart, log.seen)
     assert steps == sorted(set(steps))
     assert all(apart[i, j] for i in steps for j in steps if i != j)
