@@ -16,7 +16,7 @@ one node, linked by rotations both ways. Nodes are apart if that follows from wh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -106,11 +106,13 @@ class FramedChart(Chart):
     facing   visit and slot of each node; a slot counts quarters clockwise from how the robot faced as it arrived
     stars    the openings seen on each visit, by slot
     travels  the links that are travels, in order: the visit's number is that of the travel after it
+    elsewhere  pairs of nodes known to be at different places
     """
 
     facing: tuple[tuple[int, int], ...]
     stars: tuple[tuple[int, ...], ...]
     travels: tuple[tuple[int, int, int], ...]
+    elsewhere: Collection[tuple[int, int]] = ()
 
     def apart(self, most: int) -> NDArray[np.bool_]:
         """Which pairs of the first nodes are apart: no frame has both visits so turned that the two nodes are one dstate.
@@ -144,6 +146,8 @@ class FramedChart(Chart):
         for visit, (s, a, _) in enumerate(self.travels):
             leaves[visit], action[visit] = self.facing[s][1], a
         misfits = np.zeros((4, visits, visits), dtype=bool)
+        for s, x in self.elsewhere:
+            misfits[:, self.facing[s][0], self.facing[x][0]] = misfits[:, self.facing[x][0], self.facing[s][0]] = True
         for i in range(visits - 1, -1, -1):
             for r in range(4):
                 row = misfits[r, i]

@@ -177,6 +177,9 @@ class Engine:
         """All maps of the prefix that cost this and no more; or `enough` of them, unless that is 0."""
         raise NotImplementedError
 
+    def settle(self) -> None:
+        """End what is still under way in clingo, when a search is over: a thread left behind would abort Python at its end."""
+
     def _answers(
         self,
         read: Callable[[clingo.Model], Answer],

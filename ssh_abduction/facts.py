@@ -226,7 +226,7 @@ def street_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
 
 def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int]) -> str:
     """The dstate of each node, what is open from it, and what is preferred, as facts for the least streets."""
-    facts = [f"is({node},{label})." for node, label in enumerate(labels)]
+    facts = [settled_labels(labels)]
     for label, node in dict(zip(reversed(labels), range(len(labels) - 1, -1, -1), strict=True)).items():
         visit, slot = chart.facing[node]
         star = chart.stars[visit]
@@ -238,6 +238,16 @@ def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int]) -> 
 def dstate_at(node: int, label: int) -> Symbol:
     """The atom that puts a node at a dstate."""
     return Function("is", [Number(node), Number(label)])
+
+
+def read_elsewhere(model: Model) -> set[tuple[int, int]]:
+    """Pairs of nodes that are at different places."""
+    return {(x, y) for _, (x, y) in map(_atom, model.symbols(shown=True))}
+
+
+def settled_labels(labels: Iterable[int]) -> str:
+    """The dstate of each node, as facts."""
+    return "\n".join(f"is({node},{label})." for node, label in enumerate(labels))
 
 
 def open_labels(labels: Sequence[int]) -> str:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import replace
 from itertools import islice, permutations, product
 
 import clingo
@@ -120,10 +121,8 @@ class FramedEngine(NamedEngine):
     def _streets(self, labels: Sequence[int], mode: str) -> Iterator[Found]:
         """Maps with these dstates."""
         began = time.perf_counter()
-        control = clingo.Control(["--warn=none"])
-        for name in ("streets", "preference"):
-            control.load(encodings.path(name))
-        control.add("base", [], facts.street_facts(self._trace, self._theory, self._chart))
+        control = self._streets_of(self._chart)
+        control.load(encodings.path("preference"))
         control.add("base", [], facts.settled_facts(self._theory, self._chart, labels))
         control.ground([("base", []), ("least", [])])
         self._watch.check()
@@ -169,9 +168,7 @@ class FramedEngine(NamedEngine):
 
     def _clashing(self, labels: Sequence[int]) -> list[list[int]]:
         """Sets of nodes, none in two of them, each smallest so that no streets fit their labels."""
-        control = clingo.Control(["--warn=none"])
-        control.load(encodings.path("streets"))
-        control.add("base", [], facts.street_facts(self._trace, self._theory, self._chart))
+        control = self._streets_of(self._chart)
         control.add("base", [], facts.open_labels(labels))
         control.ground([("base", [])])
         found: list[list[int]] = []
@@ -180,11 +177,22 @@ class FramedEngine(NamedEngine):
             core = self._core(control, left, labels)
             if core is None:
                 return found or [list(range(len(labels)))]
-            for node in list(core):
-                fewer = self._core(control, [other for other in core if other != node], labels) if node in core else None
-                core = fewer or core
+            core = self._smallest(control, core, labels)
             found.append(core)
             left = [node for node in left if node not in core]
+
+    def _smallest(self, control: clingo.Control, core: list[int], labels: Sequence[int]) -> list[int]:
+        """A core none of whose nodes can be spared: parts of it are left out, half of it first, single nodes last."""
+        size = len(core)
+        while size := size // 2:
+            start = 0
+            while start < len(core):
+                fewer = self._core(control, core[:start] + core[start + size :], labels)
+                if fewer is None:
+                    start += size
+                else:
+                    core = sorted(fewer)
+        return core
 
     def _core(self, control: clingo.Control, nodes: Sequence[int], labels: Sequence[int]) -> list[int] | None:
         """Some of these nodes whose labels no streets fit; None where they have streets."""
@@ -202,7 +210,20 @@ class FramedEngine(NamedEngine):
         return (view, self._spare[view].index(label)) if view >= 0 else (-1, label)
 
     def _charted(self, size: int) -> Chart:
-        return Chart.framed(self._trace, self._log, size)
+        """The nodes, and which of them are at different places because of what the trace alone says of order and sides."""
+        chart = Chart.framed(self._trace, self._log, size)
+        control = self._streets_of(chart)
+        control.add("base", [], facts.settled_labels(range(len(chart.seen))))
+        control.ground([("base", []), ("apart", [])])
+        self._watch.check()
+        return next((replace(chart, elsewhere=pairs) for pairs in self._answers(facts.read_elsewhere, "ignore", 1, control=control)), chart)
+
+    def _streets_of(self, chart: FramedChart) -> clingo.Control:
+        """A control with the axioms of places and paths, and what happened."""
+        control = clingo.Control(["--warn=none"])
+        control.load(encodings.path("streets"))
+        control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
+        return control
 
     def _columns(self, nodes: Sequence[int]) -> NDArray[np.bool_]:
         """Of nodes beyond the matrix only what they show is known."""

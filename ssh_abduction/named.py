@@ -148,6 +148,7 @@ class NamedEngine(Engine):
 
     def _first_of_bound(self) -> dict[int, int]:
         """Raise the bound until there is a map that costs no more. All links are given."""
+        self._end_begun()
         while True:
             spares = (self.bound or 0) - len(self.clique)
             answers = self._answers(facts.read_names, f"enum,{spares},{spares}", 0)
@@ -170,6 +171,9 @@ class NamedEngine(Engine):
         begun, self._begun = self._begun, None
         yield self._first
         yield from (answer for answer in begun if not self._rests(answer))
+
+    def settle(self) -> None:
+        self._end_begun()
 
     def _end_begun(self) -> None:
         if self._begun is not None:
@@ -228,6 +232,7 @@ class NamedEngine(Engine):
 
     def _restart(self) -> None:
         """Take a new control, for other names."""
+        self._watch.check()
         began = time.perf_counter()
         self._end_begun()
         seen = self._chart.seen
@@ -255,11 +260,14 @@ class NamedEngine(Engine):
         self._batches = 0
         self.ground_seconds += time.perf_counter() - began
         links, self._links = self._links, {}
-        self._add(links)
+        self._give(links)
 
     def _add(self, links: Iterable[Link]) -> None:
-        """Give clingo these links, and the nodes at their ends."""
+        """Give clingo more links, and the nodes at their ends."""
         self._watch.check()
+        self._give(links)
+
+    def _give(self, links: Iterable[Link]) -> None:
         began = time.perf_counter()
         added = [link for link in links if link not in self._links]
         given: list[tuple[int, int, Sequence[int], int | None]] = []

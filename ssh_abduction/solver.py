@@ -331,6 +331,7 @@ class Search:
             self.stopped = "interrupted"
         finally:
             self._watch.stop()
+            self._engine.settle()
         self._raise_bound(self._engine.bound)
         if self.stopped and self.status is not Status.OPTIMAL:
             if self.best is None and self.stopped == "time limit" and self._watch.has_reserve:
@@ -537,6 +538,7 @@ class Search:
         with suppress(Stopped, KeyboardInterrupt):
             self._engine.grow(len(self.trace))
             self.status = Status.OPTIMAL if self._minimise() else Status.UNSATISFIABLE
+        self._engine.settle()
         self._watch.stop()
 
     def _best_cost(self) -> Cost | None:
