@@ -31,6 +31,7 @@ from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
+SPARES = 4  # spare names of a view, to begin with
 RENAMED = 50  # ways to rename the spare names of a clash that clingo is told of, at most
 
 Clash = tuple[tuple[int, tuple[int, int]], ...]  # nodes at dstates that do not go together
@@ -44,6 +45,8 @@ class FramedEngine(NamedEngine):
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
         super().__init__(trace, theory, watch, log, speedups)
         self.paths = len(trace)  # names for paths are never short
+        self._first_spares = SPARES
+        self._cores = -1  # cores are about few views
         self._fits = True  # whether the visits fit their frames
         self._clashes: list[Clash] = []
         self._best: tuple[tuple[int, ...], list[list[int]]] | None = None  # the minimal cost, and all namings that have it
@@ -67,19 +70,20 @@ class FramedEngine(NamedEngine):
         if not self._fits:
             return
         best: Found | None = None
-        namings: list[list[int]] = []
-        while best is None:
-            labels = self._minimal_labels()
-            best = self._with_least_streets(labels)
-            if best is None:
-                self._forbid(labels)
-        yield best
-        for labels in self._fitting(best.cost[0]):
-            found = self._with_least_streets(labels)
-            assert found is not None
-            if found.cost < best.cost:
-                best, namings = found, []
+        labels = self._minimal_labels()
+        while True:
+            for best in self._better_streets(labels):
                 yield best
+            if best is not None:
+                break
+            self._forbid(labels)
+            labels = self._labels_at_bound() or self._minimal_labels()
+        namings: list[list[int]] = []
+        for labels in self._fitting(best.cost[0]):
+            for found in self._better_streets(labels):
+                if found.cost < best.cost:
+                    best, namings = found, []
+                    yield best
             if found.cost == best.cost:
                 namings.append(labels)
         self._best = best.cost, namings
@@ -104,7 +108,7 @@ class FramedEngine(NamedEngine):
                 for labels in namings:
                     if tuple(labels) in known:
                         continue
-                    if self._with_least_streets(labels) is None:
+                    if next(self._streets(labels, "ignore"), None) is None:
                         refused = labels
                         break
                     known.add(tuple(labels))
@@ -113,10 +117,9 @@ class FramedEngine(NamedEngine):
                 return
             self._forbid(refused)
 
-    def _with_least_streets(self, labels: Sequence[int]) -> Found | None:
-        """The best map with these dstates, if there is any."""
-        every = list(self._streets(labels, "opt" if len(self._theory.priorities) > 1 else "ignore"))
-        return every[-1] if every else None
+    def _better_streets(self, labels: Sequence[int]) -> Iterator[Found]:
+        """Maps with these dstates, each better than the one before, the last one best; none if no streets fit them."""
+        return self._streets(labels, "opt" if len(self._theory.priorities) > 1 else "ignore")
 
     def _streets(self, labels: Sequence[int], mode: str) -> Iterator[Found]:
         """Maps with these dstates."""

@@ -60,6 +60,8 @@ class NamedEngine(Engine):
         super().__init__(trace, theory, watch)
         self._log = log
         self._speedups = speedups
+        self._first_spares = SPARES
+        self._cores = CORES if speedups.one_by_one else -1
         self._one_by_one = False
         self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
 
@@ -90,7 +92,7 @@ class NamedEngine(Engine):
         self._may_be = [[pinned[t]] if t in pinned else (~row).nonzero()[0].tolist() for t, row in enumerate(columns)]
         self._far = self._chart.far_apart(apart) if self._speedups.apart and len(seen) <= AT_ONCE else None
         self._one_by_one = False
-        self._spares = dict.fromkeys(seen, SPARES)
+        self._spares = dict.fromkeys(seen, self._first_spares)
         self._links = dict.fromkeys(self._chart.links)
         if self._speedups.lazy:
             first = {0, *self.clique}
@@ -121,7 +123,7 @@ class NamedEngine(Engine):
         while not self._one_by_one:
             lazy = len(self._links) < len(self._chart.links)
             answer = None
-            most = PATIENCE if lazy else CORES if self._speedups.one_by_one else -1
+            most = PATIENCE if lazy else self._cores
             answers = self._answers(facts.read_names, "opt", 0, conflicts=most, on_bound=self._raise_bound)
             while True:
                 try:
@@ -140,6 +142,18 @@ class NamedEngine(Engine):
                     return labels
                 self._add(failed)
         return self._follow(self._first_of_bound())[0]
+
+    def _labels_at_bound(self) -> list[int] | None:
+        """Names that need no more dstates than the bound, where clingo finds some soon: after it was told more, most of what it knows holds."""
+        while True:
+            spares = (self.bound or 0) - len(self.clique)
+            answer = next(self._answers(facts.read_names, f"enum,{spares},0", 1, conflicts=PATIENCE), None)
+            if answer is None:
+                return None
+            labels, failed = self._follow(answer)
+            if not failed:
+                return labels
+            self._add(failed)
 
     def _ask_one_by_one(self) -> None:
         self._one_by_one = True

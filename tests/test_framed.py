@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from unittest.mock import patch
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from instances import maze
 from strategies import STARS
 
-from ssh_abduction import Search, Speedups, Theory, Trace, solve, solver
-from ssh_abduction.chart import QUARTERS
+from ssh_abduction import Search, Speedups, Status, Theory, Trace, named, solve, solver
+from ssh_abduction.chart import QUARTERS, Chart, NoFrame
 from ssh_abduction.checker import check
 from ssh_abduction.framed import FramedEngine
+from ssh_abduction.replay import Log
 from ssh_abduction.speedups import SPEEDUPS
 
 PLAIN = Speedups.without(SPEEDUPS)
@@ -70,3 +73,99 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory) -> N
         assert [getattr(found.cost, name) for name in theory.prefer] == [getattr(expected.cost, name) for name in theory.prefer]
     for ssh_map in maps[:3]:
         assert check(trace, ssh_map, theory) == ()
+
+
+def test_apart_nodes_are_different_dstates_of_the_world() -> None:
+    """In a world that satisfies the theory, what the trace alone tells apart is apart."""
+    for seed in range(6):
+        walk = maze(3, 3, steps=120, seed=seed, stars=True)
+        search = Search(walk.trace, Theory.topological())
+        engine = search._engine
+        assert isinstance(engine, FramedEngine)
+        chart = engine._charted(len(walk.trace))
+        truth = dict(zip(chart.node_of, walk.truth, strict=True))
+        assert len(truth) == len(chart.seen)
+        apart = chart.apart(1000)
+        assert (apart == apart.T).all()
+        assert not any(truth[i] == truth[j] for i, j in zip(*apart.nonzero(), strict=True))
+        assert any(truth[i][:2] != truth[j][:2] for i, j in chart.elsewhere)
+        assert not any(truth[i][:2] == truth[j][:2] for i, j in chart.elsewhere)
+
+
+def test_nodes_that_one_frame_fits_are_not_apart() -> None:
+    """A node for a visit and a way of facing, linked by rotations both ways and by travels."""
+    star = [(0, 0, 1, 0), (1, 0, 0, 0), (1, 0, 1, 0), (1, 0, 1, 0)]
+    trace = Trace.from_steps(
+        "aabbbb", ["around", "travel", "around", "right", "right"], stars=[*star[:2], *star[2:], (0, 1, 0, 1), (1, 0, 1, 0)]
+    )
+    chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
+    assert chart.node_of == (0, 1, 2, 3, 4, 2)
+    assert {(s, a, x) for s, a, x in chart.links if a < 0} == {
+        (0, -2, 1),
+        (1, -2, 0),
+        (2, -2, 3),
+        (3, -2, 2),
+        (2, -3, 4),
+        (4, -1, 2),
+        (3, -1, 4),
+        (4, -3, 3),
+    }
+    assert [(s, x) for s, _, x in chart.travels] == [(1, 2)]
+    apart = chart.apart(10)
+    assert not apart[2, 2]
+    assert apart[2, 3]  # they see the same, but face different slots of one place
+
+
+def test_a_visit_that_fits_no_frame_has_no_map() -> None:
+    stars = [(1, 0, 0, 0), (0, 0, 0, 1), (0, 0, 1, 0), (0, 1, 0, 0), (1, 1, 0, 0)]
+    trace = Trace.from_steps("aaaaa" * 6, ["right"] * 29, stars=stars * 6)
+    with pytest.raises(NoFrame):
+        Chart.framed(trace, Log(trace, Theory(star="frame")))
+    solution = solve(trace, Theory.topological())
+    assert solution.status is Status.UNSATISFIABLE
+    assert solution.complete
+
+
+@pytest.mark.parametrize(("seed", "counts"), [(0, (32, 8, 4)), (2, (24, 6, 4)), (3, (16, 4, 2))])
+def test_mazes_are_mapped(seed: int, counts: tuple[int, int, int]) -> None:
+    """3 x 3 cells, of which the robot sees some. What the trace alone says of order and sides keeps the dstates of the last two apart."""
+    walk = maze(3, 3, steps=200, seed=seed, stars=True)
+    search = Search(walk.trace, Theory.topological())
+    maps = tuple(search)
+    solution = search.solution(maps)
+    assert solution.status is Status.OPTIMAL
+    assert solution.complete
+    assert solution.cost
+    assert (solution.cost.dstates, solution.cost.places, solution.cost.paths) == counts
+    assert solution.bound.dstates == counts[0] <= len(set(walk.truth))
+    for ssh_map in maps:
+        assert check(walk.trace, ssh_map, Theory.topological()) == ()
+
+
+def test_without_what_is_told_beforehand_clashes_find_it() -> None:
+    """Every answer is refused until clingo was told what order and sides forbid; the maps are the same."""
+    walk = maze(2, 2, steps=60, seed=1, stars=True)
+    expected = solve(walk.trace, Theory.topological(), maps=0)
+    with patch.object(FramedEngine, "_charted", lambda engine, size: Chart.framed(engine._trace, engine._log, size)):
+        search = Search(walk.trace, Theory.topological(), maps=0)
+        maps = tuple(search)
+    assert isinstance(search._engine, FramedEngine)
+    assert search._engine._clashes
+    assert set(maps) == set(expected.maps)
+
+
+def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
+    """Stopped while streets are sought for the fewest dstates, and while the dstates are."""
+    walk = maze(3, 3, steps=200, seed=1, stars=True)
+    with patch.object(FramedEngine, "_fitting", side_effect=KeyboardInterrupt), patch.object(named, "FIRST_PREFIXES", 300):
+        search = Search(walk.trace, Theory.topological())
+        search._start = 201
+        solution = search.solution(tuple(search))
+    assert solution.status is Status.FEASIBLE
+    assert solution.cost
+    assert solution.cost.dstates == solution.bound.dstates == 36
+    assert check(walk.trace, solution.maps[0], Theory.topological()) == ()
+    with patch.object(FramedEngine, "_minimal_labels", side_effect=KeyboardInterrupt):
+        solution = solve(walk.trace, Theory.topological())
+    assert solution.status is Status.FEASIBLE
+    assert check(walk.trace, solution.maps[0], Theory.topological()) == ()
