@@ -23,14 +23,19 @@ from ssh_abduction.speedups import SPEEDUPS
 
 CAUSAL = ["rectangle n=400", "rectangle n=40000", "moore 8/2 n=800", "moore 30/10 n=200", "moore 100/10 n=3200"]
 CAUSAL += ["maze 2x2 n=1600", "maze 3x3 n=1600", "maze 4x4 n=1600"]
-FULL = ["full rectangle n=400", SMALL.name, "full taylor-hall", "full aces3"]
-ONLY_CAUSAL = {"names", "clique", "apart", "lazy", "core_guided", "one_by_one", "greedy"}
+FULL = ["full rectangle n=400", "full taylor-hall", "full aces3"]
+FRAMED = [SMALL.name, "full maze 5x5 n=1600"]
+USED = {
+    "causal": {"prefixes", "names", "clique", "apart", "lazy", "core_guided", "one_by_one", "greedy"},
+    "full": {"prefixes", "path_names", "from_below"},
+    "framed": {"prefixes", "names", "clique", "lazy", "core_guided"},
+}
 
 
 def variants(instance: Instance) -> list[str]:
     """The speed-ups to leave out, one at a time and all: those that the theory of the instance uses."""
-    used = [name for name in SPEEDUPS if instance.causal == (name in ONLY_CAUSAL) or name == "prefixes"]
-    return [*used, ",".join(SPEEDUPS)]
+    theory = "causal" if instance.causal else "framed" if instance.name in FRAMED else "full"
+    return [*(name for name in SPEEDUPS if name in USED[theory]), ",".join(SPEEDUPS)]
 
 
 def main() -> None:
@@ -42,7 +47,7 @@ def main() -> None:
     options = parser.parse_args()
     results: dict[str, Any] = {"date": datetime.date.today().isoformat(), "limit": options.limit, "memory": options.memory, "seeds": 1}
     results |= {"machine": machine(), "packages": {k: v for k, v in packages().items() if k in (OURS, "clingo")}, "cells": []}
-    for name in CAUSAL + FULL:
+    for name in CAUSAL + FULL + FRAMED:
         if re.search(options.only, name):
             for off in ["", *variants(INSTANCES[name])]:
                 tool = OURS + (WITHOUT + off if off else "")

@@ -13,7 +13,7 @@ these do not go together, and asked again. As every map of the full theory keeps
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from itertools import islice, permutations, product
@@ -32,6 +32,7 @@ from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
 SPARES = 4  # spare names of a view, to begin with
+BETTERING = 20_000  # conflicts after which better streets are no longer sought one after another
 RENAMED = 50  # ways to rename the spare names of a clash that clingo is told of, at most
 
 Clash = tuple[tuple[int, tuple[int, int]], ...]  # nodes at dstates that do not go together
@@ -118,13 +119,18 @@ class FramedEngine(NamedEngine):
             self._forbid(refused)
 
     def _better_streets(self, labels: Sequence[int]) -> Iterator[Found]:
-        """Maps with these dstates, each better than the one before, the last one best; none if no streets fit them."""
-        return self._streets(labels, "opt" if len(self._theory.priorities) > 1 else "ignore")
+        """Maps with these dstates, each as good as the one before or better, the last one best; none if no streets fit them.
 
-    def _streets(self, labels: Sequence[int], mode: str) -> Iterator[Found]:
-        """Maps with these dstates."""
+        Where bettering maps does not end soon, the bound is raised from below instead.
+        """
+        proven = yield from self._streets(labels, "opt" if len(self._theory.priorities) > 1 else "ignore", BETTERING)
+        if not proven:
+            yield from self._streets(labels, "opt", options=["--opt-strategy=usc"])
+
+    def _streets(self, labels: Sequence[int], mode: str, conflicts: int = -1, options: Sequence[str] = ()) -> Generator[Found, None, bool]:
+        """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
         began = time.perf_counter()
-        control = self._streets_of(self._chart)
+        control = self._streets_of(self._chart, options)
         control.load(encodings.path("preference"))
         control.add("base", [], facts.settled_facts(self._theory, self._chart, labels))
         control.ground([("base", []), ("least", [])])
@@ -135,7 +141,8 @@ class FramedEngine(NamedEngine):
         def read(model: clingo.Model) -> Found:
             return Found(facts.read_streets(model, self._trace, self._chart, labels), (dstates, *model.cost[1:]))
 
-        yield from self._answers(read, mode, int(mode == "ignore"), control=control)
+        one = int(mode == "ignore")
+        return (yield from self._answers(read, mode, one, control=control, conflicts=conflicts)) or bool(one)
 
     def _forbid(self, labels: Sequence[int]) -> None:
         """Tell clingo which of these labels do not go together."""
@@ -221,9 +228,9 @@ class FramedEngine(NamedEngine):
         self._watch.check()
         return next((replace(chart, elsewhere=pairs) for pairs in self._answers(facts.read_elsewhere, "ignore", 1, control=control)), chart)
 
-    def _streets_of(self, chart: FramedChart) -> clingo.Control:
+    def _streets_of(self, chart: FramedChart, options: Sequence[str] = ()) -> clingo.Control:
         """A control with the axioms of places and paths, and what happened."""
-        control = clingo.Control(["--warn=none"])
+        control = clingo.Control(["--warn=none", *options])
         control.load(encodings.path("streets"))
         control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
         return control

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import STARS
 
-from ssh_abduction import Search, Speedups, Status, Theory, Trace, named, solve, solver
+from ssh_abduction import Search, Speedups, Status, Theory, Trace, framed, named, solve, solver
 from ssh_abduction.chart import QUARTERS, Chart, NoFrame
 from ssh_abduction.checker import check
 from ssh_abduction.framed import FramedEngine
@@ -57,12 +57,12 @@ def framed_theories(draw: st.DrawFn) -> Theory:
 
 
 @settings(max_examples=250, deadline=None, derandomize=True)
-@given(framed_traces(), framed_theories())
-def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory) -> None:
+@given(framed_traces(), framed_theories(), st.sampled_from([0, framed.BETTERING]), st.sampled_from([2, named.FIRST_PREFIXES]))
+def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, bettering: int, first: int) -> None:
     expected = solve(trace, theory, maps=0, speedups=PLAIN)
-    with patch.object(solver, "FEW_STEPS", 0):
+    with patch.object(solver, "FEW_STEPS", 0), patch.object(framed, "BETTERING", bettering), patch.object(named, "FIRST_PREFIXES", first):
         search = Search(trace, theory, maps=0)
-    maps = tuple(search)
+        maps = tuple(search)
     found = search.solution(maps)
     assert isinstance(search._engine, FramedEngine)
     assert found.status is expected.status
