@@ -84,13 +84,14 @@ class Watch:
     def elapsed(self) -> float:
         return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
 
-    def check(self) -> None:
+    def check(self, ahead: float = 0.0) -> None:
+        """Raise if a limit is over, or would be after so many seconds of what cannot be interrupted."""
         if self.interrupted:
             raise Stopped("interrupted")
         if self.elapsed() > self._next_tick:
             self._next_tick = self.elapsed() + TICK
             self._on_tick()
-        if self._allowed is not None and self.elapsed() > self._allowed:
+        if self._allowed is not None and self.elapsed() + ahead > self._allowed:
             raise Stopped("time limit")
         if self._memory is not None and peak_memory() > self._memory:
             raise Stopped("memory limit")

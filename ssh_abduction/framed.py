@@ -65,20 +65,22 @@ class FramedEngine(NamedEngine):
         try:
             super().grow(size)
         except NoFrame:
-            self._fits = False
+            self._fits, self.size = False, size
 
     def improving_maps(self) -> Iterator[Found]:
         if not self._fits:
             return
         best: Found | None = None
         labels = self._minimal_labels()
-        while True:
+        while labels is not None:
             for best in self._better_streets(labels):
                 yield best
             if best is not None:
                 break
             self._forbid(labels)
             labels = self._labels_at_bound() or self._minimal_labels()
+        if best is None:
+            return
         namings: list[list[int]] = []
         for labels in self._fitting(best.cost[0]):
             for found in self._better_streets(labels):
@@ -102,17 +104,19 @@ class FramedEngine(NamedEngine):
 
     def _fitting(self, dstates: int) -> Iterator[list[int]]:
         """All namings of so many dstates that have streets, each once."""
-        known: set[tuple[int, ...]] = set()
+        known: set[tuple[int, ...]] = set()  # with dstates numbered by first visit, as a restart renames them
         while True:
             refused: list[int] | None = None
             with closing(self._labels_of(dstates, 0)) as namings:
                 for labels in namings:
-                    if tuple(labels) in known:
+                    number: dict[int, int] = {}
+                    numbered = tuple(number.setdefault(label, len(number)) for label in labels)
+                    if numbered in known:
                         continue
                     if next(self._streets(labels, "ignore"), None) is None:
                         refused = labels
                         break
-                    known.add(tuple(labels))
+                    known.add(numbered)
                     yield labels
             if refused is None:
                 return
@@ -123,7 +127,10 @@ class FramedEngine(NamedEngine):
 
         Where bettering maps does not end soon, the bound is raised from below instead.
         """
-        proven = yield from self._streets(labels, "opt" if len(self._theory.priorities) > 1 else "ignore", BETTERING)
+        if len(self._theory.priorities) == 1:
+            yield from self._streets(labels, "ignore")
+            return
+        proven = yield from self._streets(labels, "opt", BETTERING)
         if not proven:
             yield from self._streets(labels, "opt", options=["--opt-strategy=usc"])
 
@@ -141,8 +148,7 @@ class FramedEngine(NamedEngine):
         def read(model: clingo.Model) -> Found:
             return Found(facts.read_streets(model, self._trace, self._chart, labels), (dstates, *model.cost[1:]))
 
-        one = int(mode == "ignore")
-        return (yield from self._answers(read, mode, one, control=control, conflicts=conflicts)) or bool(one)
+        return (yield from self._answers(read, mode, int(mode == "ignore"), control=control, conflicts=conflicts))
 
     def _forbid(self, labels: Sequence[int]) -> None:
         """Tell clingo which of these labels do not go together."""
@@ -163,7 +169,7 @@ class FramedEngine(NamedEngine):
         for clash in clashes:
             spares = sorted({name for _, name in clash if name[0] >= 0})
             own = {view: [name for name in spares if name[0] == view] for view, _ in spares}
-            ways = [permutations(self._spare[view][:-1], len(names)) for view, names in own.items()]
+            ways = [islice(permutations(self._spare[view][:-1], len(names)), RENAMED) for view, names in own.items()]
             for way in [
                 tuple(tuple(self._spare[view][k] for view, k in names) for names in own.values()),
                 *islice(product(*ways), RENAMED),

@@ -62,6 +62,7 @@ class NamedEngine(Engine):
         self._speedups = speedups
         self._first_spares = SPARES
         self._cores = CORES if speedups.one_by_one else -1
+        self._restart_seconds = 0.0  # what the last new control took
         self._one_by_one = False
         self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
 
@@ -80,6 +81,14 @@ class NamedEngine(Engine):
     def grow(self, size: int) -> None:
         if size == self.size:
             return
+        try:
+            self._take(size)
+        except BaseException:
+            self.size = 0  # nothing of this prefix is to be taken for granted
+            raise
+
+    def _take(self, size: int) -> None:
+        """Chart the first steps, pin a clique of their nodes, and take a control for them."""
         began = time.perf_counter()
         self.size = size
         self._chart = self._charted(size)
@@ -110,14 +119,16 @@ class NamedEngine(Engine):
         return np.stack([apart_from(self._chart.seen, self._log.actions[: self.size - 1], t) for t in nodes], axis=1)
 
     def improving_maps(self) -> Iterator[Found]:
-        yield self._found(self._minimal_labels())
+        labels = self._minimal_labels()
+        if labels is not None:
+            yield self._found(labels)
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         for labels in self._labels_of(cost[0], enough):
             yield self._found(labels)
 
-    def _minimal_labels(self) -> list[int]:
-        """Names for all nodes that need the fewest dstates."""
+    def _minimal_labels(self) -> list[int] | None:
+        """Names for all nodes that need the fewest dstates; None where clingo was told more than any names can satisfy."""
         if not self._chart.links:
             return [0]
         while not self._one_by_one:
@@ -131,7 +142,9 @@ class NamedEngine(Engine):
                 except StopIteration as end:
                     proven = end.value
                     break
-            if not proven or answer is None:
+            if proven and answer is None:
+                return None
+            if answer is None or not proven:
                 if not lazy:
                     self._ask_one_by_one()
                 self._add(self._chart.links)
@@ -246,7 +259,7 @@ class NamedEngine(Engine):
 
     def _restart(self) -> None:
         """Take a new control, for other names."""
-        self._watch.check()
+        self._watch.check(self._restart_seconds)
         began = time.perf_counter()
         self._end_begun()
         seen = self._chart.seen
@@ -275,6 +288,7 @@ class NamedEngine(Engine):
         self.ground_seconds += time.perf_counter() - began
         links, self._links = self._links, {}
         self._give(links)
+        self._restart_seconds = time.perf_counter() - began
 
     def _add(self, links: Iterable[Link]) -> None:
         """Give clingo more links, and the nodes at their ends."""

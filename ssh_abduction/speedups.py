@@ -15,7 +15,7 @@ class Speedups:
     prefixes     solve for a prefix, replay its maps, and extend it where they fail
     path_names   begin with few names for paths
     from_below   ask a longer prefix first for a map that costs what was proved for a shorter one
-    names        causal theory: give the dstates names beforehand
+    names        causal theory, and full theory where places have frames: give the dstates names beforehand
     clique       with names: pin steps that are pairwise apart
     apart        with names: say which steps are apart, where more than one action shows it
     lazy         with names: give clingo only the links that replaying contradicts

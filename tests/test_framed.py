@@ -169,3 +169,19 @@ def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
         solution = solve(walk.trace, Theory.topological())
     assert solution.status is Status.FEASIBLE
     assert check(walk.trace, solution.maps[0], Theory.topological()) == ()
+
+
+def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
+    """Else the time that is kept for any map would be spent on the engine of a shorter prefix, and its map be taken for the whole trace's."""
+    walk = maze(3, 3, steps=120, seed=1, stars=True)
+    search = Search(walk.trace, Theory.topological(), limit=30)
+    engine = search._engine
+    engine.grow(40)
+    with patch.object(FramedEngine, "_charted", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
+        engine.grow(121)
+    assert engine.size == 0
+    search._start = 121
+    maps = tuple(search)
+    assert search.status is Status.OPTIMAL
+    for ssh_map in maps:
+        assert check(walk.trace, ssh_map, Theory.topological()) == ()
