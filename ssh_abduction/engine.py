@@ -130,7 +130,7 @@ class Engine:
 
     bound   lower bound, proven, on the count that is preferred first; None where nothing is known before a search ends
     paths   how many names for paths there are
-    clique  steps that are pairwise apart (apart.py), if it needs to know some
+    clique  nodes that are pairwise apart (chart.py), if it needs to know some; in the causal theory they are steps
     """
 
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, paths: int = 0) -> None:

@@ -383,7 +383,7 @@ class Search:
         if RESTS_ON & set(self.theory.without):
             return None
         proven = self.bound.dstates or 0
-        if self._engine.clique:
+        if self._engine.clique and self.theory.level == "causal":  # in other theories more than actions and views tells nodes apart
             return Evidence((), (), proven, tuple(self._engine.clique))
         number: dict[object, int] = {}
         views = tuple(number.setdefault(step.view, len(number)) for step in self.trace.steps[: min(max(size, 1), AT_ONCE)])

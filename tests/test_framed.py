@@ -14,6 +14,7 @@ from ssh_abduction import Search, Speedups, Status, Theory, Trace, framed, named
 from ssh_abduction.chart import QUARTERS, Chart, NoFrame
 from ssh_abduction.checker import check
 from ssh_abduction.framed import FramedEngine
+from ssh_abduction.proof import check_bound
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import SPEEDUPS
 
@@ -138,6 +139,10 @@ def test_mazes_are_mapped(seed: int, counts: tuple[int, int, int]) -> None:
     assert solution.cost
     assert (solution.cost.dstates, solution.cost.places, solution.cost.paths) == counts
     assert solution.bound.dstates == counts[0] <= len(set(walk.truth))
+    assert solution.certificate
+    proven = check_bound(walk.trace, solution.certificate.to_dict(walk.trace))  # by actions and views alone, of steps rather than nodes
+    assert not proven.faults
+    assert proven.dstates + len(proven.refuted) == counts[0]
     for ssh_map in maps:
         assert check(walk.trace, ssh_map, Theory.topological()) == ()
 
