@@ -22,13 +22,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from ssh_abduction.replay import Log
-from ssh_abduction.trace import Trace
+from ssh_abduction.trace import Trace, TurnDirection
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-QUARTERS = {"right": 1, "around": 2, "left": 3}
+QUARTERS: dict[TurnDirection | None, int] = {"right": 1, "around": 2, "left": 3}
 
 
 class NoFrame(Exception):  # noqa: N818 - not an error
@@ -80,7 +80,7 @@ class Chart:
             if t and (action := trace.actions[t - 1]).kind == "travel":
                 visit, slot = visit + 1, 0
             elif t:
-                slot = (slot + QUARTERS[action.turn or ""]) % 4
+                slot = (slot + QUARTERS[action.turn]) % 4
             openings = trace.steps[t].openings or ()
             star = tuple(int(openings[(k - slot) % 4]) for k in range(4))
             if visit == len(stars):

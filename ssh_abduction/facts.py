@@ -227,7 +227,7 @@ def street_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
 def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int]) -> str:
     """The dstate of each node, what is open from it, and what is preferred, as facts for the least streets."""
     facts = [settled_labels(labels)]
-    for label, node in dict(zip(reversed(labels), range(len(labels) - 1, -1, -1), strict=True)).items():
+    for label, node in {label: node for node, label in enumerate(labels)}.items():  # any node of a dstate sees the same star
         visit, slot = chart.facing[node]
         star = chart.stars[visit]
         facts += [f"open({label},{k})." for k in range(4) if star[(slot + k) % 4]]

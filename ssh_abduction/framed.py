@@ -38,6 +38,12 @@ RENAMED = 50  # ways to rename the spare names of a clash that clingo is told of
 Clash = tuple[tuple[int, tuple[int, int]], ...]  # nodes at dstates that do not go together
 
 
+def _numbered(labels: Sequence[int]) -> tuple[int, ...]:
+    """The labels with dstates numbered by first visit: a restart renames them."""
+    number: dict[int, int] = {}
+    return tuple(number.setdefault(label, len(number)) for label in labels)
+
+
 class FramedEngine(NamedEngine):
     """The full theory with frames, fewest dstates first."""
 
@@ -52,20 +58,12 @@ class FramedEngine(NamedEngine):
         self._clashes: list[Clash] = []
         self._best: tuple[tuple[int, ...], list[list[int]]] | None = None  # the minimal cost, and all namings that have it
 
-    def with_paths(self, paths: int) -> FramedEngine:
-        return FramedEngine(self._trace, self._theory, self._watch, self._log, self._speedups)
-
-    def over(self, trace: Trace, watch: Watch, log: Log) -> FramedEngine:
-        return FramedEngine(trace, self._theory, watch, log, self._speedups)
-
-    def grow(self, size: int) -> None:
-        if size == self.size:
-            return
+    def _take(self, size: int) -> None:
         self._clashes, self._best = [], None
         try:
-            super().grow(size)
+            super()._take(size)
         except NoFrame:
-            self._fits, self.size = False, size
+            self._fits = False
 
     def improving_maps(self) -> Iterator[Found]:
         if not self._fits:
@@ -79,16 +77,16 @@ class FramedEngine(NamedEngine):
                 break
             self._forbid(labels)
             labels = self._labels_at_bound() or self._minimal_labels()
-        if best is None:
+        if best is None or labels is None:
             return
-        namings: list[list[int]] = []
-        for labels in self._fitting(best.cost[0]):
-            for found in self._better_streets(labels):
+        namings = [labels]
+        for others in self._fitting(best.cost[0], besides=labels):
+            for found in self._better_streets(others):
                 if found.cost < best.cost:
                     best, namings = found, []
                     yield best
             if found.cost == best.cost:
-                namings.append(labels)
+                namings.append(others)
         self._best = best.cost, namings
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
@@ -102,21 +100,19 @@ class FramedEngine(NamedEngine):
                 if count == enough:
                     return
 
-    def _fitting(self, dstates: int) -> Iterator[list[int]]:
-        """All namings of so many dstates that have streets, each once."""
-        known: set[tuple[int, ...]] = set()  # with dstates numbered by first visit, as a restart renames them
+    def _fitting(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[list[int]]:
+        """All namings of so many dstates that have streets, each once, and not that one."""
+        known = {_numbered(besides)}
         while True:
             refused: list[int] | None = None
             with closing(self._labels_of(dstates, 0)) as namings:
                 for labels in namings:
-                    number: dict[int, int] = {}
-                    numbered = tuple(number.setdefault(label, len(number)) for label in labels)
-                    if numbered in known:
+                    if _numbered(labels) in known:
                         continue
                     if next(self._streets(labels, "ignore"), None) is None:
                         refused = labels
                         break
-                    known.add(numbered)
+                    known.add(_numbered(labels))
                     yield labels
             if refused is None:
                 return

@@ -67,10 +67,10 @@ class NamedEngine(Engine):
         self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
 
     def with_paths(self, paths: int) -> NamedEngine:
-        return NamedEngine(self._trace, self._theory, self._watch, self._log, self._speedups)
+        return type(self)(self._trace, self._theory, self._watch, self._log, self._speedups)
 
     def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
-        return NamedEngine(trace, self._theory, watch, log, self._speedups)
+        return type(self)(trace, self._theory, watch, log, self._speedups)
 
     def next_size(self, failed: int) -> int:
         steps = len(self._trace)
@@ -142,12 +142,12 @@ class NamedEngine(Engine):
                 except StopIteration as end:
                     proven = end.value
                     break
-            if proven and answer is None:
-                return None
-            if answer is None or not proven:
+            if not proven:
                 if not lazy:
                     self._ask_one_by_one()
                 self._add(self._chart.links)
+            elif answer is None:
+                return None
             elif not self._widened(answer):
                 self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
                 labels, failed = self._follow(answer)

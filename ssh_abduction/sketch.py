@@ -22,12 +22,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from ssh_abduction.chart import QUARTERS
 from ssh_abduction.maps import DState, Path, SSHMap
 from ssh_abduction.replay import observation
 from ssh_abduction.theory import Theory
-from ssh_abduction.trace import Action, Step, TurnDirection, View
-
-QUARTERS: dict[TurnDirection | None, int] = {"right": 1, "around": 2, "left": 3}
+from ssh_abduction.trace import Action, Step, View
 
 
 class _Contradiction(Exception):  # noqa: N818 - not an error
