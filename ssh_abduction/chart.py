@@ -128,8 +128,17 @@ class FramedChart(Chart):
         apart |= (visits[:, None] == visits[None, :]) & (rotated != 0)
         return apart
 
-    def far_apart(self, apart: NDArray[np.bool_]) -> None:
-        """None: a visit knows so much that the links are enough."""
+    @cached_property
+    def leaves(self) -> dict[int, tuple[int, int]]:
+        """The slot that a visit ends at, and the action there, which leads to the next visit."""
+        return {visit: (self.facing[node][1], action) for visit, (node, action, _) in enumerate(self.travels)}
+
+    def fits(self) -> list[tuple[int, int, int]]:
+        """Visits I < J that may be at one place, and R, where slot 0 of I is then slot R of J."""
+        import numpy as np
+
+        turns, first, second = np.nonzero(np.triu(~self._misfits, 1))
+        return list(zip(first.tolist(), second.tolist(), turns.tolist(), strict=True))
 
     @cached_property
     def _misfits(self) -> NDArray[np.bool_]:
@@ -143,8 +152,8 @@ class FramedChart(Chart):
         stars = np.asarray(self.stars)
         leaves = np.full(visits, -1)  # the slot that a visit ends at, none for the last
         action = np.full(visits, -1)
-        for visit, (s, a, _) in enumerate(self.travels):
-            leaves[visit], action[visit] = self.facing[s][1], a
+        for visit, (slot, done) in self.leaves.items():
+            leaves[visit], action[visit] = slot, done
         misfits = np.zeros((4, visits, visits), dtype=bool)
         for s, x in self.elsewhere:
             misfits[:, self.facing[s][0], self.facing[x][0]] = misfits[:, self.facing[x][0], self.facing[s][0]] = True

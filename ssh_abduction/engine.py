@@ -191,8 +191,9 @@ class Engine:
         conflicts: int = -1,
         on_bound: Callable[[Sequence[int]], None] | None = None,
         control: clingo.Control | None = None,
+        until: Callable[[], bool] = lambda: False,
     ) -> Generator[Answer, None, bool]:
-        """What clingo answers, read at once. Returns whether it came to an end, and not to the limit of conflicts."""
+        """What clingo answers, read at once. Returns whether it came to an end, and not to the limit of conflicts, or to where `until` holds."""
         control = control or self._control
         configuration: Any = control.configuration.solve
         configuration.opt_mode = mode
@@ -208,6 +209,8 @@ class Engine:
                     handle.resume()
                     while not handle.wait(POLL):
                         self._watch.check()
+                        if until():
+                            return False
                     self._watch.check()
                     model = handle.model()
                     if model is None:
@@ -223,6 +226,32 @@ class Engine:
             finally:
                 handle.cancel()
                 self.solve_seconds += max(0.0, time.perf_counter() - began)
+
+    def _verdict(
+        self, read: Callable[[clingo.Model], Answer], assumed: Sequence[int], conflicts: int = -1, mode: str = "ignore"
+    ) -> tuple[Answer | None, list[int] | None]:
+        """An answer that these literals are true in, or else a core of them; neither where the limit of conflicts was reached."""
+        configuration: Any = self._control.configuration.solve
+        configuration.opt_mode, configuration.models, configuration.project = mode, 1, "no"
+        configuration.solve_limit = f"{conflicts},-1"
+        began = time.perf_counter()
+        with ExitStack() as stack:
+            with _held_back_interrupts():
+                handle = stack.enter_context(self._control.solve(assumed, yield_=True, async_=True))
+            try:
+                while not handle.wait(POLL):
+                    self._watch.check()
+                self._watch.check()
+                model = handle.model()
+                if model is not None:
+                    return read(model), None
+                result = handle.get()
+                if result.interrupted and conflicts < 0:
+                    raise Stopped("interrupted")
+                return None, handle.core() if result.unsatisfiable else None
+            finally:
+                handle.cancel()
+                self.solve_seconds += time.perf_counter() - began
 
 
 class StepEngine(Engine):

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 
-from clingo import Function, Model, Number, String, Symbol, SymbolType
+from clingo import Control, Function, Model, Number, String, Symbol, SymbolicAtom, SymbolType
 
 from ssh_abduction.chart import FramedChart
 from ssh_abduction.maps import DState, Path, SSHMap
@@ -201,6 +201,55 @@ def read_names(model: Model) -> dict[int, int]:
     return {s.arguments[0].number: s.arguments[1].number for s in model.symbols(shown=True)}
 
 
+def visit_facts(chart: FramedChart, order: Iterable[int], fits: Iterable[tuple[int, int, int]]) -> str:
+    """Visits that may be one, where each ends, and its nodes, numbered in that order."""
+    facts = [f"node({place},{visit},{slot})." for place, node in enumerate(order) for visit, slot in (chart.facing[node],)]
+    facts += [f"leaves({visit},{slot},{action})." for visit, (slot, action) in chart.leaves.items()]
+    facts += [f"fits({i},{j},{r})." for i, j, r in fits]
+    return "\n".join(facts)
+
+
+def pair_atoms(control: Control) -> dict[tuple[int, int, int], SymbolicAtom]:
+    """The atoms of same.lp that two visits are the same, by visits and how they are turned."""
+    atoms = control.symbolic_atoms.by_signature("same", 3)
+    return {(i.number, j.number, r.number): atom for atom in atoms for i, j, r in (atom.symbol.arguments,)}
+
+
+def alone(place: int) -> Symbol:
+    """The atom that the node at this place of the order is the first at its dstate."""
+    return Function("alone", [Number(place)])
+
+
+def over(core: int, count: int) -> Symbol:
+    """The atom that so many members of a core are there."""
+    return Function("over", numbers(core, count))
+
+
+def read_over(member: Symbol) -> tuple[int, int] | None:
+    """The core and the count of such an atom; None for another."""
+    return (member.arguments[0].number, member.arguments[1].number) if member.name == "over" else None
+
+
+def core_facts(core: int, members: Iterable[Symbol]) -> str:
+    """The members of a core."""
+    return "\n".join(f"member({core},{member})." for member in members)
+
+
+def three_facts(batch: int, threes: Iterable[tuple[int, ...]]) -> str:
+    """Visits of which it matters that to be the same is transitive."""
+    return "\n".join(f"via({batch},{','.join(map(str, three))})." for three in threes)
+
+
+def forbidden_pairs(same: Iterable[tuple[int, int, int]], different: Iterable[tuple[int, int, int]] = ()) -> str:
+    """The rule that these pairs of visits are not all the same while those are not."""
+    return f":- {', '.join([*(f'same({i},{j},{r})' for i, j, r in same), *(f'not same({i},{j},{r})' for i, j, r in different)])}."
+
+
+def numbers(*arguments: int) -> list[Symbol]:
+    """The arguments of a program part."""
+    return [Number(argument) for argument in arguments]
+
+
 def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
     """The map of the causal level that these labels of the first steps make, dstates numbered by first visit."""
     number: dict[int, int] = {}
@@ -235,11 +284,6 @@ def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int]) -> 
     return "\n".join(facts)
 
 
-def dstate_at(node: int, label: int) -> Symbol:
-    """The atom that puts a node at a dstate."""
-    return Function("is", [Number(node), Number(label)])
-
-
 def read_elsewhere(model: Model) -> set[tuple[int, int]]:
     """Pairs of nodes that are at different places."""
     return {(x, y) for _, (x, y) in map(_atom, model.symbols(shown=True))}
@@ -251,13 +295,8 @@ def settled_labels(labels: Iterable[int]) -> str:
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """The dstate of each node, for clingo to take or leave, as long as nothing is violated."""
-    return "\n".join([*(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)), ":- violated."])
-
-
-def forbidden(placed: Sequence[tuple[int, int]]) -> str:
-    """The rule that these nodes are not all at these dstates."""
-    return f":- {', '.join(f'is({node},{label})' for node, label in placed)}."
+    """The dstate of each node, for clingo to take or leave, as long as something is violated."""
+    return "\n".join([*(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)), ":- not violated.", "#show is/2."])
 
 
 def read_streets(model: Model, trace: Trace, chart: FramedChart, labels: Sequence[int]) -> SSHMap:

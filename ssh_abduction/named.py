@@ -60,17 +60,15 @@ class NamedEngine(Engine):
         super().__init__(trace, theory, watch)
         self._log = log
         self._speedups = speedups
-        self._first_spares = SPARES
-        self._cores = CORES if speedups.one_by_one else -1
         self._restart_seconds = 0.0  # what the last new control took
         self._one_by_one = False
         self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
 
     def with_paths(self, paths: int) -> NamedEngine:
-        return type(self)(self._trace, self._theory, self._watch, self._log, self._speedups)
+        return NamedEngine(self._trace, self._theory, self._watch, self._log, self._speedups)
 
     def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
-        return type(self)(trace, self._theory, watch, log, self._speedups)
+        return NamedEngine(trace, self._theory, watch, log, self._speedups)
 
     def next_size(self, failed: int) -> int:
         steps = len(self._trace)
@@ -91,7 +89,7 @@ class NamedEngine(Engine):
         """Chart the first steps, pin a clique of their nodes, and take a control for them."""
         began = time.perf_counter()
         self.size = size
-        self._chart = self._charted(size)
+        self._chart = Chart.of_steps(self._log, size)
         seen = self._chart.seen
         apart = self._chart.apart(AT_ONCE)
         self._watch.check()
@@ -101,7 +99,7 @@ class NamedEngine(Engine):
         self._may_be = [[pinned[t]] if t in pinned else (~row).nonzero()[0].tolist() for t, row in enumerate(columns)]
         self._far = self._chart.far_apart(apart) if self._speedups.apart and len(seen) <= AT_ONCE else None
         self._one_by_one = False
-        self._spares = dict.fromkeys(seen, self._first_spares)
+        self._spares = dict.fromkeys(seen, SPARES)
         self._links = dict.fromkeys(self._chart.links)
         if self._speedups.lazy:
             first = {0, *self.clique}
@@ -109,10 +107,6 @@ class NamedEngine(Engine):
         self.bound = max(self.bound or 0, len(self.clique))
         self.ground_seconds += time.perf_counter() - began
         self._restart()
-
-    def _charted(self, size: int) -> Chart:
-        """The nodes that the first steps are."""
-        return Chart.of_steps(self._log, size)
 
     def _columns(self, nodes: Sequence[int]) -> NDArray[np.bool_]:
         """The columns of these nodes in the matrix of apart nodes, where that is too large."""
@@ -134,7 +128,7 @@ class NamedEngine(Engine):
         while not self._one_by_one:
             lazy = len(self._links) < len(self._chart.links)
             answer = None
-            most = PATIENCE if lazy else self._cores
+            most = PATIENCE if lazy else CORES if self._speedups.one_by_one else -1
             answers = self._answers(facts.read_names, "opt", 0, conflicts=most, on_bound=self._raise_bound)
             while True:
                 try:
@@ -155,18 +149,6 @@ class NamedEngine(Engine):
                     return labels
                 self._add(failed)
         return self._follow(self._first_of_bound())[0]
-
-    def _labels_at_bound(self) -> list[int] | None:
-        """Names that need no more dstates than the bound, where clingo finds some soon: after it was told more, most of what it knows holds."""
-        while True:
-            spares = (self.bound or 0) - len(self.clique)
-            answer = next(self._answers(facts.read_names, f"enum,{spares},0", 1, conflicts=PATIENCE), None)
-            if answer is None:
-                return None
-            labels, failed = self._follow(answer)
-            if not failed:
-                return labels
-            self._add(failed)
 
     def _ask_one_by_one(self) -> None:
         self._one_by_one = True

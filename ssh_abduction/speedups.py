@@ -19,7 +19,8 @@ class Speedups:
     clique       with names: pin steps that are pairwise apart
     apart        with names: say which steps are apart, where more than one action shows it
     lazy         with names: give clingo only the links that replaying contradicts
-    core_guided  with names: raise the bound from below, rather than better the map
+    core_guided  with names or frames: raise the bound from below, rather than better the map
+    small_cores  with frames: make cores smaller, as long as that is cheap
     one_by_one   with names: where that stalls, ask for numbers of dstates one by one
     greedy       some map without a search, for a time limit that leaves no other
     """
@@ -32,6 +33,7 @@ class Speedups:
     apart: bool = True
     lazy: bool = True
     core_guided: bool = True
+    small_cores: bool = True
     one_by_one: bool = True
     greedy: bool = True
 

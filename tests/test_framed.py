@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import STARS
 
-from ssh_abduction import Search, Speedups, Status, Theory, Trace, framed, named, solve, solver
+from ssh_abduction import Search, Speedups, Status, Theory, Trace, framed, same, solve, solver
 from ssh_abduction.chart import QUARTERS, Chart, NoFrame
 from ssh_abduction.checker import check
 from ssh_abduction.framed import FramedEngine
@@ -57,12 +57,26 @@ def framed_theories(draw: st.DrawFn) -> Theory:
     )
 
 
-@settings(max_examples=250, deadline=None, derandomize=True)
-@given(framed_traces(), framed_theories(), st.sampled_from([0, framed.BETTERING]), st.sampled_from([2, named.FIRST_PREFIXES]))
-def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, bettering: int, first: int) -> None:
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(framed_traces(), framed_theories(), st.sets(st.sampled_from(SPEEDUPS)), st.data())
+def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off: set[str], data: st.DataObject) -> None:
+    """With prefixes, cores and what is told in one go so small that all of it happens on short traces; and with any speed-ups off."""
     expected = solve(trace, theory, maps=0, speedups=PLAIN)
-    with patch.object(solver, "FEW_STEPS", 0), patch.object(framed, "BETTERING", bettering), patch.object(named, "FIRST_PREFIXES", first):
-        search = Search(trace, theory, maps=0)
+    draw = {
+        "FIRST_PREFIXES": data.draw(st.sampled_from([2, same.FIRST_PREFIXES]), label="first prefixes"),
+        "AT_A_TIME": data.draw(st.sampled_from([1, same.AT_A_TIME]), label="at a time"),
+        "MANY": data.draw(st.sampled_from([1, 2, same.MANY]), label="many"),
+        "FAR": data.draw(st.sampled_from([0, same.FAR]), label="far"),
+        "TRIES": data.draw(st.sampled_from([0, same.TRIES]), label="tries"),
+        "FAILED_TRIES": data.draw(st.sampled_from([1, same.FAILED_TRIES]), label="failed tries"),
+    }
+    streets = {
+        "BETTERING": data.draw(st.sampled_from([0, framed.BETTERING]), label="bettering"),
+        "CLASHES": data.draw(st.sampled_from([1, framed.CLASHES]), label="clashes"),
+    }
+    off -= {"names"}
+    with patch.object(solver, "FEW_STEPS", 0), patch.multiple(same, **draw), patch.multiple(framed, **streets):
+        search = Search(trace, theory, maps=0, speedups=Speedups.without(off))
         maps = tuple(search)
     found = search.solution(maps)
     assert isinstance(search._engine, FramedEngine)
@@ -70,10 +84,24 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, bett
     assert set(maps) == set(expected.maps)
     assert len(set(maps)) == len(maps)
     assert found.complete
+    assert found.bound.dstates == expected.bound.dstates
     if found.cost and expected.cost:
         assert [getattr(found.cost, name) for name in theory.prefer] == [getattr(expected.cost, name) for name in theory.prefer]
     for ssh_map in maps[:3]:
         assert check(trace, ssh_map, theory) == ()
+
+
+@pytest.mark.parametrize("off", ["", "clique", "core_guided", "small_cores"])
+@pytest.mark.parametrize("seed", range(3))
+def test_each_speedup_off_alone(seed: int, off: str) -> None:
+    """On walks long enough for cores, for visits that have to be told to be transitive, and for maps that are found nearby."""
+    trace = maze(2, 2, steps=45, seed=seed, stars=True).trace
+    expected = solve(trace, Theory.topological(), maps=0, speedups=Speedups.without("names"))
+    with patch.multiple(same, MANY=1, AT_A_TIME=5):
+        found = solve(trace, Theory.topological(), maps=0, speedups=Speedups.without(off))
+    assert set(found.maps) == set(expected.maps)
+    assert found.cost == expected.cost
+    assert found.bound.dstates == expected.bound.dstates
 
 
 def test_apart_nodes_are_different_dstates_of_the_world() -> None:
@@ -155,14 +183,14 @@ def test_without_what_is_told_beforehand_clashes_find_it() -> None:
         search = Search(walk.trace, Theory.topological(), maps=0)
         maps = tuple(search)
     assert isinstance(search._engine, FramedEngine)
-    assert search._engine._clashes
+    assert search._engine.clashes
     assert set(maps) == set(expected.maps)
 
 
 def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
     """Stopped while streets are sought for the fewest dstates, and while the dstates are."""
     walk = maze(3, 3, steps=200, seed=1, stars=True)
-    with patch.object(FramedEngine, "_fitting", side_effect=KeyboardInterrupt), patch.object(named, "FIRST_PREFIXES", 300):
+    with patch.object(FramedEngine, "_fitting", side_effect=KeyboardInterrupt), patch.object(same, "FIRST_PREFIXES", 300):
         search = Search(walk.trace, Theory.topological())
         search._start = 201
         solution = search.solution(tuple(search))

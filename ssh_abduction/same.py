@@ -1,0 +1,383 @@
+"""An engine that finds the fewest dstates without naming any: clingo is asked which visits are one (same.lp).
+
+Names are poor knowledge where many dstates are known from few visits: what is learned of one spare name has to be learned again of
+the next, and each is a choice for nodes all over the world. That two visits are the same is only about these two. A node is
+*alone* if no node before it, in an order of choice, is at its dstate; there are as many dstates as lone nodes.
+
+*Order.* A clique of nodes that are apart comes first, then what fits few others.
+
+*Transitive.* That I is J and J is K, so I is K, is said only of visits where an answer fails to hold it: there are some millions of
+threes. Until no answer fails, what clingo solves is a relaxation, so its bounds hold.
+
+*From below.* clingo is asked for an answer without lone nodes but those that are alone for sure. A core, nodes that cannot all be
+avoided, raises the bound by one; from then on it is asked that at most one of them is alone, then two, and so on (OLL: Andres,
+Kaufmann, Matheis, Schaub 2012, "Unsatisfiability-based optimization in clasp"). Each optimum of the whole holds what is asked for
+in the end, so these answers are all minimal ones. clasp has that built in, but begins anew with each call, and an answer that
+fails to be transitive is a call. Cores are made small as long as that is cheap: small ones are about one part of the world.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from typing import TypeAlias
+
+import clingo
+
+from ssh_abduction import encodings, facts
+from ssh_abduction.apart import clique
+from ssh_abduction.chart import FramedChart
+from ssh_abduction.engine import AT_ONCE, Engine, Watch
+from ssh_abduction.replay import Log
+from ssh_abduction.speedups import Speedups
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Trace
+
+FIRST_PREFIXES = 32  # steps of a prefix that is tried before that
+SECONDS_A_PAIR = 3e-5  # what clingo takes, about, to ground two visits that may be one: it cannot be stopped meanwhile
+AT_A_TIME = 20_000  # threes of visits that clingo is told of in one go
+TRIES = 100  # conflicts after which it is left open whether a core can be smaller
+FAILED_TRIES = 20  # tries after which a core is kept as it is
+MANY = 5  # answers found one by one, after which they are looked for nearby
+FAR = 200  # failures to be transitive after which an answer is not nearby
+
+Pair: TypeAlias = tuple[int, int, int]  # visits I < J, R: slot 0 of I is slot R of J
+Three: TypeAlias = tuple[int, int, int, int, int]  # visits I < J < K, and how I is turned to J, and J to K
+
+
+class SameEngine(Engine):
+    """Which visits are one, so that dstates are fewest."""
+
+    _chart: FramedChart
+
+    def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
+        super().__init__(trace, theory, watch)
+        self._log = log
+        self._speedups = speedups
+
+    def with_paths(self, paths: int) -> SameEngine:
+        return type(self)(self._trace, self._theory, self._watch, self._log, self._speedups)
+
+    def over(self, trace: Trace, watch: Watch, log: Log) -> SameEngine:
+        return type(self)(trace, self._theory, watch, log, self._speedups)
+
+    def next_size(self, failed: int) -> int:
+        steps = len(self._trace)
+        if self.size < FIRST_PREFIXES:
+            return min(steps, max(failed + 1, FIRST_PREFIXES))
+        return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * self.size, AT_ONCE))
+
+    def grow(self, size: int) -> None:
+        if size == self.size:
+            return
+        try:
+            self._take(size)
+        except BaseException:
+            self.size = 0  # nothing of this prefix is to be taken for granted
+            raise
+
+    def _charted(self, size: int) -> FramedChart:
+        """The nodes and visits of the first steps."""
+        raise NotImplementedError
+
+    def _take(self, size: int) -> None:
+        """Chart the first steps, and take a control for their visits."""
+        began = time.perf_counter()
+        self.size = size
+        chart = self._chart = self._charted(size)
+        apart = chart.apart(len(chart.seen))
+        self._watch.check()
+        self.clique = clique(apart, chart.seen) if self._speedups.clique else []
+        order = [*self.clique, *sorted(set(range(len(apart))) - set(self.clique), key=lambda node: (-int(apart[node].sum()), node))]
+        self._fits = frozenset(chart.fits())
+        self._watch.check(SECONDS_A_PAIR * len(self._fits))
+        self._control = clingo.Control(["--warn=none"])
+        self._control.load(encodings.path("same"))
+        self._control.add("base", [], facts.visit_facts(chart, order, self._fits))
+        self._control.ground([("base", [])])
+        alone = [self._control.symbolic_atoms[facts.alone(place)] for place in range(len(order))]
+        # What an answer should not have, if that can be.
+        self._avoided = {atom.literal: atom.symbol for atom in alone if atom and not atom.is_fact}
+        self._least = len(order) - len(self._avoided)
+        self._raise_bound()
+        atoms = facts.pair_atoms(self._control)
+        self._pair_of = {atom.symbol: pair for pair, atom in atoms.items()}
+        self._transitive = _Transitive({pair: atom.literal for pair, atom in atoms.items()})
+        self._control.register_propagator(self._transitive)
+        self._core_sizes: list[int] = []
+        self._found: list[tuple[int, ...]] = []  # labels that `_labels_of` found
+        self._excluded = 0  # so many of them clingo will not find again
+        self._parts = 0
+        self.ground_seconds += time.perf_counter() - began
+
+    def _raise_bound(self) -> None:
+        self.bound = max(self.bound or 0, self._least)
+
+    def _minimal_labels(self) -> list[int] | None:
+        """Dstates of all nodes, as few as can be; None where clingo was told more than any can satisfy."""
+        if self._found:
+            return list(self._found[0])
+        while True:
+            pairs = self._fewest()
+            if pairs is None:
+                return None
+            if not (threes := self._intransitive(pairs)):
+                return self._labels(pairs)
+            self._close(threes)
+
+    def _fewest(self) -> list[Pair] | None:
+        """An answer with the fewest lone nodes."""
+        if not self._speedups.core_guided:
+            better = list(self._answers(lambda model: (self._pairs(model), model.cost[0]), "opt", 0))
+            if not better:
+                return None
+            pairs, self._least = better[-1]
+            self._raise_bound()
+            return pairs
+        while True:
+            answer, core = self._without(list(self._avoided))
+            if core is None:
+                return answer
+            if not core:
+                return None
+            self._relax(self._smaller(core) if self._speedups.small_cores else core)
+
+    def _without(
+        self, avoided: Sequence[int], conflicts: int = -1, mode: str = "ignore", read: bool = True
+    ) -> tuple[list[Pair] | None, list[int] | None]:
+        """An answer without these atoms, or else some of them that cannot all be avoided; neither where clingo came to no end."""
+        pairs, core = self._verdict(self._pairs if read else lambda _: None, [-literal for literal in avoided], conflicts, mode)
+        return pairs, None if core is None else [-literal for literal in core]
+
+    def _pairs(self, model: clingo.Model) -> list[Pair]:
+        return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
+
+    def _smaller(self, core: list[int]) -> list[int]:
+        """A core of fewer members, as long as that is cheap: parts of it are left out, half of it first, single members last."""
+        size, failed = len(core), 0
+        while size := size // 2:
+            start = 0
+            while start < len(core) and len(core) > 1:
+                _, fewer = self._without(core[:start] + core[start + size :], TRIES, read=False)
+                if fewer is not None:
+                    core = fewer
+                    continue
+                start += size
+                failed += 1
+                if failed == FAILED_TRIES:
+                    return core
+        return core
+
+    def _relax(self, core: Sequence[int]) -> None:
+        """As not all members of a core can be avoided, ask only that no two of them are there."""
+        members = [self._avoided.pop(literal) for literal in core]
+        self._least += 1
+        self._raise_bound()
+        for member in members:
+            if (over := facts.read_over(member)) is not None:
+                self._limit(over[0], over[1] + 1)
+        if len(members) > 1:
+            number = len(self._core_sizes)
+            self._core_sizes.append(len(members))
+            self._tell(facts.core_facts(number, members), "core", number)
+            self._limit(number, 2)
+
+    def _limit(self, core: int, count: int) -> None:
+        """Ask that fewer than so many members of a core are there."""
+        if count <= self._core_sizes[core]:
+            self._control.ground([("over", facts.numbers(core, count))])
+            if atom := self._control.symbolic_atoms[facts.over(core, count)]:
+                self._avoided[atom.literal] = atom.symbol
+
+    def _tell(self, told: str, part: str | None = None, number: int = 0) -> None:
+        """Tell clingo more."""
+        self._watch.check()
+        began = time.perf_counter()
+        name = f"told_{self._parts}"
+        self._parts += 1
+        self._control.add(name, [], told)
+        self._control.ground([(name, [])])
+        if part is not None:
+            self._control.ground([(part, facts.numbers(number))])
+        self.ground_seconds += time.perf_counter() - began
+
+    def _close(self, threes: Iterable[Three]) -> None:
+        """Tell clingo that to be the same is transitive, of these visits."""
+        self._tell(facts.three_facts(self._parts, threes), "closed", self._parts)
+
+    def _labels_of(self, dstates: int) -> Generator[list[int], None, None]:
+        """All ways to be at so many dstates, each once.
+
+        Each is asked for as the fewest dstates were, once clingo is told not to find again what was found: so it is soon seen that there
+        is no other. Where there are many, the next one is near, and a propagator keeps answers transitive (`_nearby`).
+        """
+        if self._minimal_labels() is None or self._least > dstates:
+            return
+        yield from map(list, self._found)
+        asked = 0
+        while True:
+            known = [facts.forbidden_pairs(self._spanning(found, range(len(found)))) for found in self._found[self._excluded :]]
+            self._tell("\n".join(known))
+            self._excluded = len(self._found)
+            labels = self._other(dstates)
+            if labels is None:
+                return
+            self._found.append(tuple(labels))
+            yield labels
+            asked += 1
+            if asked == MANY:
+                asked = 0
+                if (yield from self._nearby(dstates)):
+                    return
+
+    def _nearby(self, dstates: int) -> Generator[list[int], None, bool]:
+        """Answers, each from the one before. Returns whether these are all that was not excluded."""
+
+        def read(model: clingo.Model) -> list[int]:
+            self._transitive.failed = 0
+            return self._labels(self._pairs(model))
+
+        avoided = [(atom, False) for atom in self._avoided.values()] if self._speedups.core_guided else []
+        excluded = set(self._found[self._excluded :])
+        self._transitive.asked, self._transitive.failed = True, 0
+        answers = self._answers(read, self._mode(dstates), 0, assumptions=avoided, until=lambda: self._transitive.failed > FAR)
+        try:
+            while True:
+                try:
+                    labels = next(answers)
+                except StopIteration as end:
+                    return bool(end.value)
+                if tuple(labels) not in excluded:
+                    self._found.append(tuple(labels))
+                    yield labels
+        finally:
+            answers.close()
+            self._transitive.asked = False
+
+    def _other(self, dstates: int) -> list[int] | None:
+        """An answer of so many dstates that was not excluded."""
+        avoided = list(self._avoided) if self._speedups.core_guided else []
+        while True:
+            pairs, _ = self._without(avoided, mode=self._mode(dstates))
+            if pairs is None:
+                return None
+            if not (threes := self._intransitive(pairs)):
+                return self._labels(pairs)
+            self._close(threes)
+
+    def _mode(self, dstates: int) -> str:
+        return "ignore" if self._speedups.core_guided else f"enum,{dstates}"
+
+    def _spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
+        """Pairs that are the same if these nodes are at the dstates that they are labelled with."""
+        first: dict[int, int] = {}
+        return [self._pair(other, node) for node in nodes if (other := first.setdefault(labels[node], node)) != node]
+
+    def _pair(self, a: int, b: int) -> Pair:
+        """How the visits of two nodes are turned where these are at one dstate."""
+        (i, s), (j, t) = sorted((self._chart.facing[a], self._chart.facing[b]))
+        return i, j, (t - s) % 4
+
+    def _intransitive(self, pairs: Sequence[Pair]) -> list[Three]:
+        """Visits of which an answer, with what follows from it, does not hold that to be the same is transitive."""
+        found: dict[Three, None] = {}
+        turned: dict[int, dict[int, int]] = {}  # slot 0 of a visit is which slot of the other
+        leaves = self._chart.leaves
+        work = list(pairs)
+
+        def take(i: int, j: int, r: int) -> None:
+            if turned.setdefault(i, {}).setdefault(j, r) == r:
+                turned.setdefault(j, {})[i] = -r % 4
+
+        for pair in pairs:
+            take(*pair)
+        for i, j, r in work:
+            of_i, of_j = turned[i], turned[j]
+            joined = [(i, k, (r + q) % 4, j, r) for k, q in of_j.items() if k != i and of_i.get(k) != (r + q) % 4]
+            joined += [(j, k, (q - r) % 4, i, -r % 4) for k, q in of_i.items() if k != j and of_j.get(k) != (q - r) % 4]
+            follows = [(i + 1, j + 1, 0)] if i in leaves and leaves.get(j) == ((leaves[i][0] + r) % 4, leaves[i][1]) else []
+            for first, last, turn, middle, half in joined:
+                found[_in_order((first, 0), (middle, half), (last, turn))] = None
+                follows.append(_pair(first, last, turn))
+            for pair in follows:
+                if pair in self._fits and pair[1] not in turned.get(pair[0], ()):
+                    take(*pair)
+                    work.append(pair)
+            if len(found) >= AT_A_TIME:
+                break
+        return list(found)
+
+    def _labels(self, pairs: Iterable[Pair]) -> list[int]:
+        """The dstate of each node in an answer that is transitive, numbered by the first node there."""
+        first: dict[int, tuple[int, int]] = {}
+        for i, j, r in sorted(pairs):
+            first.setdefault(j, (i, r))
+        number: dict[tuple[int, int], int] = {}
+        labels = []
+        for visit, slot in self._chart.facing:
+            i, r = first.get(visit, (visit, 0))
+            labels.append(number.setdefault((i, (slot - r) % 4), len(number)))
+        return labels
+
+
+class _Transitive(clingo.Propagator):
+    """A propagator for when all answers are wanted: few conflicts, and each answer has to be transitive."""
+
+    def __init__(self, literals: Mapping[Pair, int]) -> None:
+        self.asked = False
+        self.failed = 0  # how often not, since this was set to 0
+        self._program_literals = literals
+        self._watched: dict[int, list[Pair]] = {}
+        self._literals: dict[Pair, int] = {}
+        self._turned: dict[int, dict[int, int]] = {}
+
+    def init(self, init: clingo.PropagateInit) -> None:
+        for literal in self._watched:
+            init.remove_watch(literal)
+        self._watched, self._turned = {}, {}
+        if not self.asked:
+            return
+        for pair, program_literal in self._program_literals.items():
+            literal = self._literals[pair] = init.solver_literal(program_literal)
+            self._watched.setdefault(literal, []).append(pair)
+            if init.assignment.is_true(literal):
+                self._take(pair)
+        for literal in self._watched:
+            init.add_watch(literal)
+
+    def propagate(self, control: clingo.PropagateControl, changes: Sequence[int]) -> None:
+        pairs = [pair for literal in changes for pair in self._watched.get(literal, ())]
+        for pair in pairs:
+            self._take(pair)
+        for i, j, r in pairs:
+            of_i, of_j = self._turned[i], self._turned[j]
+            joined = [(i, k, (r + q) % 4, j, q) for k, q in of_j.items() if k != i and of_i.get(k) != (r + q) % 4]
+            joined += [(j, k, (q - r) % 4, i, q) for k, q in of_i.items() if k != j and of_j.get(k) != (q - r) % 4]
+            for first, last, turn, middle, half in joined:
+                self.failed += 1
+                third = self._literals.get(_pair(first, last, turn))
+                clause = [-self._literals[i, j, r], -self._literals[_pair(middle, last, half)]]
+                if not control.add_clause(clause if third is None else [*clause, third], lock=True) or not control.propagate():
+                    return
+
+    def undo(self, thread: int, assignment: clingo.Assignment, changes: Sequence[int]) -> None:
+        for literal in changes:
+            for i, j, _ in self._watched.get(literal, ()):
+                self._turned.get(i, {}).pop(j, None)
+                self._turned.get(j, {}).pop(i, None)
+
+    def _take(self, pair: Pair) -> None:
+        i, j, r = pair
+        self._turned.setdefault(i, {})[j] = r
+        self._turned.setdefault(j, {})[i] = -r % 4
+
+
+def _pair(i: int, j: int, r: int) -> Pair:
+    """Two visits in order, where slot 0 of the one is slot R of the other."""
+    return (i, j, r) if i < j else (j, i, -r % 4)
+
+
+def _in_order(*visits: tuple[int, int]) -> Three:
+    """Three visits at one place, each with the slot of it that slot 0 of the first one is."""
+    (i, a), (j, b), (k, c) = sorted(visits)
+    return i, j, k, (b - a) % 4, (c - b) % 4
