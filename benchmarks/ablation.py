@@ -28,7 +28,7 @@ FRAMED = ["full taylor-hall", SMALL.name, "full maze 5x5 n=1600"]
 USED = {
     "causal": {"prefixes", "names", "clique", "apart", "lazy", "core_guided", "one_by_one", "greedy"},
     "full": {"prefixes", "path_names", "from_below"},
-    "framed": {"prefixes", "names", "clique", "lazy", "core_guided"},
+    "framed": {"prefixes", "names", "clique", "core_guided", "small_cores"},
 }
 
 

@@ -538,6 +538,7 @@ class Search:
         with suppress(Stopped, KeyboardInterrupt):
             self._engine.grow(len(self.trace))
             self.status = Status.OPTIMAL if self._minimise() else Status.UNSATISFIABLE
+        self._raise_bound(self._engine.bound)
         self._engine.settle()
         self._watch.stop()
 

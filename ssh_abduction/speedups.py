@@ -15,8 +15,8 @@ class Speedups:
     prefixes     solve for a prefix, replay its maps, and extend it where they fail
     path_names   begin with few names for paths
     from_below   ask a longer prefix first for a map that costs what was proved for a shorter one
-    names        causal theory, and full theory where places have frames: give the dstates names beforehand
-    clique       with names: pin steps that are pairwise apart
+    names        causal theory: give the dstates names beforehand; full theory where places have frames: settle them before places and paths
+    clique       with names: pin steps that are pairwise apart; with frames: let such nodes be the first at their dstates
     apart        with names: say which steps are apart, where more than one action shows it
     lazy         with names: give clingo only the links that replaying contradicts
     core_guided  with names or frames: raise the bound from below, rather than better the map
