@@ -190,8 +190,7 @@ class SameEngine(Engine):
                 self._avoided[atom.literal] = atom.symbol
 
     def _tell(self, told: str, part: str | None = None, number: int = 0) -> None:
-        """Tell clingo more."""
-        self._watch.check()
+        """Tell clingo more. No limit stops this: a core whose members are no longer avoided has to get its limit."""
         began = time.perf_counter()
         name = f"told_{self._parts}"
         self._parts += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from unittest.mock import patch
 
 import pytest
@@ -13,6 +14,7 @@ from strategies import STARS
 from ssh_abduction import Search, Speedups, Status, Theory, Trace, framed, same, solve, solver
 from ssh_abduction.chart import QUARTERS, Chart, NoFrame
 from ssh_abduction.checker import check
+from ssh_abduction.engine import Stopped
 from ssh_abduction.framed import FramedEngine
 from ssh_abduction.proof import check_bound
 from ssh_abduction.replay import Log
@@ -202,6 +204,34 @@ def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
         solution = solve(walk.trace, Theory.topological())
     assert solution.status is Status.FEASIBLE
     assert check(walk.trace, solution.maps[0], Theory.topological()) == ()
+
+
+def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
+    """Wherever that is: it proves the same in the last part of the time."""
+    trace = maze(10, 10, steps=150, seed=0, stars=True).trace
+    fewest: set[int] = set()
+    stopped = 0
+    for stop in [0, *range(1, 50)]:
+        engine = Search(trace, Theory.topological())._engine
+        assert isinstance(engine, FramedEngine)
+        engine.grow(len(trace))
+        checks = iter(range(1, 10**6))
+
+        def check_once(ahead: float = 0.0, stop: int = stop, checks: Iterator[int] = checks) -> None:
+            if next(checks) == stop:
+                raise Stopped("time limit")
+
+        with patch.object(engine._watch, "check", check_once):
+            try:
+                labels = engine._minimal_labels()
+            except Stopped:
+                stopped += 1
+                labels = engine._minimal_labels()
+        assert labels is not None
+        assert len(set(labels)) == engine.bound
+        fewest.add(len(set(labels)))
+    assert len(fewest) == 1
+    assert stopped > 10
 
 
 def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
