@@ -10,19 +10,21 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Any, Literal, Self, TypeAlias, TypeVar
 
 import clingo
 
 from ssh_abduction import encodings, facts
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.replay import Log
+from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
 RESERVE = 0.2  # share of the time limit kept for finding any map of the whole trace
 GROWTH = 1.25  # a prefix grows at least by this factor, so that there are few
 POLL = 0.05  # seconds between looks at the clock and for Ctrl-C
+FIRST_PREFIXES = 32  # steps of a prefix that an engine with a chart tries before AT_ONCE
 AT_ONCE = 8000  # steps that are compared in pairs; the matrix has the square of that many bytes
 TICK = 0.5  # seconds between reports of progress while clingo is busy
 
@@ -304,3 +306,37 @@ class StepEngine(Engine):
 
     def _read(self, model: clingo.Model) -> Found:
         return Found(facts.read_map(model, self._trace, self._theory), tuple(model.cost))
+
+
+class ChartedEngine(Engine):
+    """An engine that charts a prefix (chart.py) and takes a new control for it."""
+
+    def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
+        super().__init__(trace, theory, watch)
+        self._log = log
+        self._speedups = speedups
+
+    def with_paths(self, paths: int) -> Self:
+        return type(self)(self._trace, self._theory, self._watch, self._log, self._speedups)
+
+    def over(self, trace: Trace, watch: Watch, log: Log) -> Self:
+        return type(self)(trace, self._theory, watch, log, self._speedups)
+
+    def next_size(self, failed: int) -> int:
+        steps = len(self._trace)
+        if self.size < FIRST_PREFIXES:
+            return min(steps, max(failed + 1, FIRST_PREFIXES))
+        return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * self.size, AT_ONCE))
+
+    def grow(self, size: int) -> None:
+        if size == self.size:
+            return
+        try:
+            self._take(size)
+        except BaseException:
+            self.size = 0  # nothing of this prefix is to be taken for granted
+            raise
+
+    def _take(self, size: int) -> None:
+        """Take a control for the first steps."""
+        raise NotImplementedError

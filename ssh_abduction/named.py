@@ -35,13 +35,12 @@ from numpy.typing import NDArray
 from ssh_abduction import encodings, facts
 from ssh_abduction.apart import apart_from, clique
 from ssh_abduction.chart import Chart
-from ssh_abduction.engine import AT_ONCE, Engine, Found, Watch
+from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Watch
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
-FIRST_PREFIXES = 32  # steps of a prefix that is tried before that
 HELD_BACK = 100  # maps that are kept until all links are given; then they stream
 SPARES = 3  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
@@ -53,37 +52,14 @@ Link: TypeAlias = tuple[int, int, int]  # node, action, node
 _Trail: TypeAlias = "tuple[Link, _Trail] | None"
 
 
-class NamedEngine(Engine):
+class NamedEngine(ChartedEngine):
     """The causal theory, fewest dstates, with names given beforehand."""
 
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
-        super().__init__(trace, theory, watch)
-        self._log = log
-        self._speedups = speedups
+        super().__init__(trace, theory, watch, log, speedups)
         self._restart_seconds = 0.0  # what the last new control took
         self._one_by_one = False
         self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
-
-    def with_paths(self, paths: int) -> NamedEngine:
-        return NamedEngine(self._trace, self._theory, self._watch, self._log, self._speedups)
-
-    def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
-        return NamedEngine(trace, self._theory, watch, log, self._speedups)
-
-    def next_size(self, failed: int) -> int:
-        steps = len(self._trace)
-        if self.size < FIRST_PREFIXES:
-            return min(steps, max(failed + 1, FIRST_PREFIXES))
-        return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * self.size, AT_ONCE))
-
-    def grow(self, size: int) -> None:
-        if size == self.size:
-            return
-        try:
-            self._take(size)
-        except BaseException:
-            self.size = 0  # nothing of this prefix is to be taken for granted
-            raise
 
     def _take(self, size: int) -> None:
         """Chart the first steps, pin a clique of their nodes, and take a control for them."""

@@ -27,13 +27,8 @@ import clingo
 from ssh_abduction import encodings, facts
 from ssh_abduction.apart import clique
 from ssh_abduction.chart import FramedChart
-from ssh_abduction.engine import AT_ONCE, Engine, Watch
-from ssh_abduction.replay import Log
-from ssh_abduction.speedups import Speedups
-from ssh_abduction.theory import Theory
-from ssh_abduction.trace import Trace
+from ssh_abduction.engine import ChartedEngine
 
-FIRST_PREFIXES = 32  # steps of a prefix that is tried before that
 SECONDS_A_PAIR = 3e-5  # what clingo takes, about, to ground two visits that may be one: it cannot be stopped meanwhile
 AT_A_TIME = 20_000  # threes of visits that clingo is told of in one go
 TRIES = 100  # conflicts after which it is left open whether a core can be smaller
@@ -45,36 +40,10 @@ Pair: TypeAlias = tuple[int, int, int]  # visits I < J, R: slot 0 of I is slot R
 Three: TypeAlias = tuple[int, int, int, int, int]  # visits I < J < K, and how I is turned to J, and J to K
 
 
-class SameEngine(Engine):
+class SameEngine(ChartedEngine):
     """Which visits are one, so that dstates are fewest."""
 
     _chart: FramedChart
-
-    def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
-        super().__init__(trace, theory, watch)
-        self._log = log
-        self._speedups = speedups
-
-    def with_paths(self, paths: int) -> SameEngine:
-        return type(self)(self._trace, self._theory, self._watch, self._log, self._speedups)
-
-    def over(self, trace: Trace, watch: Watch, log: Log) -> SameEngine:
-        return type(self)(trace, self._theory, watch, log, self._speedups)
-
-    def next_size(self, failed: int) -> int:
-        steps = len(self._trace)
-        if self.size < FIRST_PREFIXES:
-            return min(steps, max(failed + 1, FIRST_PREFIXES))
-        return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * self.size, AT_ONCE))
-
-    def grow(self, size: int) -> None:
-        if size == self.size:
-            return
-        try:
-            self._take(size)
-        except BaseException:
-            self.size = 0  # nothing of this prefix is to be taken for granted
-            raise
 
     def _charted(self, size: int) -> FramedChart:
         """The nodes and visits of the first steps."""

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import STARS
 
-from ssh_abduction import Search, Speedups, Status, Theory, Trace, framed, same, solve, solver
+from ssh_abduction import Search, Speedups, Status, Theory, Trace, engine, framed, same, solve, solver
 from ssh_abduction.chart import QUARTERS, Chart, NoFrame
 from ssh_abduction.checker import check
 from ssh_abduction.engine import Stopped
@@ -64,8 +64,8 @@ def framed_theories(draw: st.DrawFn) -> Theory:
 def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off: set[str], data: st.DataObject) -> None:
     """With prefixes, cores and what is told in one go so small that all of it happens on short traces; and with any speed-ups off."""
     expected = solve(trace, theory, maps=0, speedups=PLAIN)
-    draw = {
-        "FIRST_PREFIXES": data.draw(st.sampled_from([2, same.FIRST_PREFIXES]), label="first prefixes"),
+    first = data.draw(st.sampled_from([2, engine.FIRST_PREFIXES]), label="first prefixes")
+    cores = {
         "AT_A_TIME": data.draw(st.sampled_from([1, same.AT_A_TIME]), label="at a time"),
         "MANY": data.draw(st.sampled_from([1, 2, same.MANY]), label="many"),
         "FAR": data.draw(st.sampled_from([0, same.FAR]), label="far"),
@@ -77,7 +77,8 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         "CLASHES": data.draw(st.sampled_from([1, framed.CLASHES]), label="clashes"),
     }
     off -= {"names"}
-    with patch.object(solver, "FEW_STEPS", 0), patch.multiple(same, **draw), patch.multiple(framed, **streets):
+    prefixes = patch.object(engine, "FIRST_PREFIXES", first)
+    with patch.object(solver, "FEW_STEPS", 0), prefixes, patch.multiple(same, **cores), patch.multiple(framed, **streets):
         search = Search(trace, theory, maps=0, speedups=Speedups.without(off))
         maps = tuple(search)
     found = search.solution(maps)
@@ -192,7 +193,7 @@ def test_without_what_is_told_beforehand_clashes_find_it() -> None:
 def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
     """Stopped while streets are sought for the fewest dstates, and while the dstates are."""
     walk = maze(3, 3, steps=200, seed=1, stars=True)
-    with patch.object(FramedEngine, "_fitting", side_effect=KeyboardInterrupt), patch.object(same, "FIRST_PREFIXES", 300):
+    with patch.object(FramedEngine, "_fitting", side_effect=KeyboardInterrupt), patch.object(engine, "FIRST_PREFIXES", 300):
         search = Search(walk.trace, Theory.topological())
         search._start = 201
         solution = search.solution(tuple(search))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from instances import moore
 from strategies import traces
 
-from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, named, solve, solver
+from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, engine, named, solve, solver
 from ssh_abduction.apart import apart_from, apartness, clique, far_apart
 from ssh_abduction.checker import check
 from ssh_abduction.replay import Log
@@ -48,8 +48,8 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trac
     held = data.draw(st.sampled_from([1, 100]), label="held back")
     cores = data.draw(st.sampled_from([0, 1, 10_000]), label="cores")
     spares, few = data.draw(st.sampled_from([(0, 0), (1, 0), (3, 2)]), label="spare names")
-    settings = patch.multiple(named, FIRST_PREFIXES=first, AT_ONCE=at_once, PATIENCE=patience, HELD_BACK=held)
-    fewer = patch.multiple(named, CORES=cores, SPARES=spares, FEW_SPARES=few)
+    settings = patch.multiple(engine, FIRST_PREFIXES=first, AT_ONCE=at_once)
+    fewer = patch.multiple(named, AT_ONCE=at_once, PATIENCE=patience, HELD_BACK=held, CORES=cores, SPARES=spares, FEW_SPARES=few)
     with settings, fewer, patch.object(solver, "FEW_STEPS", 0):
         found = solve(trace, Theory.causal(), maps=0, speedups=Speedups.without(off))
     assert found.status is expected.status is Status.OPTIMAL
@@ -87,8 +87,8 @@ def test_numbers_of_dstates_asked_for_one_by_one(seed: int, spares: int, off: st
             engine._ask_one_by_one()
 
     every = solve(trace, Theory.causal(), maps=0, speedups=Speedups.without("names"))
-    few = patch.multiple(named, SPARES=spares, FEW_SPARES=spares, FIRST_PREFIXES=len(trace))
-    with few, patch.object(named.NamedEngine, "grow", grow_and_ask):
+    few = patch.multiple(named, SPARES=spares, FEW_SPARES=spares)
+    with few, patch.object(engine, "FIRST_PREFIXES", len(trace)), patch.object(named.NamedEngine, "grow", grow_and_ask):
         found = solve(trace, Theory.causal(), maps=0, limit=30, speedups=Speedups.without(off))
         some = solve(trace, Theory.causal(), maps=3, limit=30, speedups=Speedups.without(off))
     assert found.status is some.status is Status.OPTIMAL
