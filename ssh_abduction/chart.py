@@ -1,4 +1,4 @@
-"""What the steps of a trace are to a solver that names dstates beforehand: nodes, the links between them, and which nodes are apart.
+"""What the steps of a trace are to an engine that settles dstates by themselves: nodes, the links between them, and which nodes are apart.
 
 To the causal theory each step is a node, and each action a link to the next. In a theory where places have frames (star=frame), a turn
 rotates by known quarters: so the steps between two travels, a *visit*, are at one place, and those of a visit that face the same way are

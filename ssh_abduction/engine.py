@@ -189,7 +189,7 @@ class Engine:
         mode: str,
         models: int,
         *,
-        assumptions: Sequence[tuple[clingo.Symbol, bool]] = (),
+        assumptions: Sequence[tuple[clingo.Symbol, bool] | int] = (),
         conflicts: int = -1,
         on_bound: Callable[[Sequence[int]], None] | None = None,
         control: clingo.Control | None = None,

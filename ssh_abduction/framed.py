@@ -38,8 +38,6 @@ BETTERING = 20_000  # conflicts after which better streets are no longer sought 
 class FramedEngine(SameEngine):
     """The full theory with frames, fewest dstates first."""
 
-    _chart: FramedChart
-
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
         super().__init__(trace, theory, watch, log, speedups)
         self.paths = len(trace)  # names for paths are never short
@@ -137,9 +135,7 @@ class FramedEngine(SameEngine):
 
     def _forbid(self, labels: Sequence[int]) -> None:
         """Tell clingo which of these labels do not go together."""
-        if (refused := tuple(labels)) in self._found:
-            self._excluded -= self._found.index(refused) < self._excluded
-            self._found.remove(refused)
+        self._refuse(labels)
         rules = []
         for clash in self._clashing(labels):
             self.clashes += 1

@@ -89,16 +89,14 @@ class NamedEngine(ChartedEngine):
         return np.stack([apart_from(self._chart.seen, self._log.actions[: self.size - 1], t) for t in nodes], axis=1)
 
     def improving_maps(self) -> Iterator[Found]:
-        labels = self._minimal_labels()
-        if labels is not None:
-            yield self._found(labels)
+        yield self._found(self._minimal_labels())
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         for labels in self._labels_of(cost[0], enough):
             yield self._found(labels)
 
-    def _minimal_labels(self) -> list[int] | None:
-        """Names for all nodes that need the fewest dstates; None where clingo was told more than any names can satisfy."""
+    def _minimal_labels(self) -> list[int]:
+        """Names for all nodes that need the fewest dstates."""
         if not self._chart.links:
             return [0]
         while not self._one_by_one:
@@ -112,12 +110,10 @@ class NamedEngine(ChartedEngine):
                 except StopIteration as end:
                     proven = end.value
                     break
-            if not proven:
+            if not proven or answer is None:
                 if not lazy:
                     self._ask_one_by_one()
                 self._add(self._chart.links)
-            elif answer is None:
-                return None
             elif not self._widened(answer):
                 self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
                 labels, failed = self._follow(answer)

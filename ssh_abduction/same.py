@@ -38,6 +38,7 @@ FAR = 200  # failures to be transitive after which an answer is not nearby
 
 Pair: TypeAlias = tuple[int, int, int]  # visits I < J, R: slot 0 of I is slot R of J
 Three: TypeAlias = tuple[int, int, int, int, int]  # visits I < J < K, and how I is turned to J, and J to K
+_Turned: TypeAlias = dict[int, dict[int, int]]  # of visits that are the same: which slot of the other slot 0 is
 
 
 class SameEngine(ChartedEngine):
@@ -65,16 +66,16 @@ class SameEngine(ChartedEngine):
         self._control.add("base", [], facts.visit_facts(chart, order, self._fits))
         self._control.ground([("base", [])])
         alone = [self._control.symbolic_atoms[facts.alone(place)] for place in range(len(order))]
-        # What an answer should not have, if that can be.
-        self._avoided = {atom.literal: atom.symbol for atom in alone if atom and not atom.is_fact}
-        self._least = len(order) - len(self._avoided)
+        unsure = {-atom.literal: atom.symbol for atom in alone if atom and not atom.is_fact}
+        self._least = len(order) - len(unsure)
+        self._avoided = unsure if self._speedups.core_guided else {}  # what is assumed not to be there, by the literal of that
         self._raise_bound()
         atoms = facts.pair_atoms(self._control)
         self._pair_of = {atom.symbol: pair for pair, atom in atoms.items()}
         self._transitive = _Transitive({pair: atom.literal for pair, atom in atoms.items()})
         self._control.register_propagator(self._transitive)
         self._core_sizes: list[int] = []
-        self._found: list[tuple[int, ...]] = []  # labels that `_labels_of` found
+        self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
         self._excluded = 0  # so many of them clingo will not find again
         self._parts = 0
         self.ground_seconds += time.perf_counter() - began
@@ -84,15 +85,15 @@ class SameEngine(ChartedEngine):
 
     def _minimal_labels(self) -> list[int] | None:
         """Dstates of all nodes, as few as can be; None where clingo was told more than any can satisfy."""
-        if self._found:
-            return list(self._found[0])
-        while True:
+        while not self._found:
             pairs = self._fewest()
             if pairs is None:
                 return None
-            if not (threes := self._intransitive(pairs)):
-                return self._labels(pairs)
-            self._close(threes)
+            if threes := self._intransitive(pairs):
+                self._close(threes)
+            else:
+                self._found.append(self._labels(pairs))
+        return list(self._found[0])
 
     def _fewest(self) -> list[Pair] | None:
         """An answer with the fewest lone nodes."""
@@ -104,19 +105,12 @@ class SameEngine(ChartedEngine):
             self._raise_bound()
             return pairs
         while True:
-            answer, core = self._without(list(self._avoided))
+            answer, core = self._verdict(self._pairs, list(self._avoided))
             if core is None:
                 return answer
             if not core:
                 return None
             self._relax(self._smaller(core) if self._speedups.small_cores else core)
-
-    def _without(
-        self, avoided: Sequence[int], conflicts: int = -1, mode: str = "ignore", read: bool = True
-    ) -> tuple[list[Pair] | None, list[int] | None]:
-        """An answer without these atoms, or else some of them that cannot all be avoided; neither where clingo came to no end."""
-        pairs, core = self._verdict(self._pairs if read else lambda _: None, [-literal for literal in avoided], conflicts, mode)
-        return pairs, None if core is None else [-literal for literal in core]
 
     def _pairs(self, model: clingo.Model) -> list[Pair]:
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
@@ -127,7 +121,7 @@ class SameEngine(ChartedEngine):
         while size := size // 2:
             start = 0
             while start < len(core) and len(core) > 1:
-                _, fewer = self._without(core[:start] + core[start + size :], TRIES, read=False)
+                _, fewer = self._verdict(lambda _: None, core[:start] + core[start + size :], TRIES)
                 if fewer is not None:
                     core = fewer
                     continue
@@ -156,7 +150,7 @@ class SameEngine(ChartedEngine):
         if count <= self._core_sizes[core]:
             self._control.ground([("over", facts.numbers(core, count))])
             if atom := self._control.symbolic_atoms[facts.over(core, count)]:
-                self._avoided[atom.literal] = atom.symbol
+                self._avoided[-atom.literal] = atom.symbol
 
     def _tell(self, told: str, part: str | None = None, number: int = 0) -> None:
         """Tell clingo more. No limit stops this: a core whose members are no longer avoided has to get its limit."""
@@ -190,8 +184,8 @@ class SameEngine(ChartedEngine):
             labels = self._other(dstates)
             if labels is None:
                 return
-            self._found.append(tuple(labels))
-            yield labels
+            self._found.append(labels)
+            yield list(labels)
             asked += 1
             if asked == MANY:
                 asked = 0
@@ -201,32 +195,30 @@ class SameEngine(ChartedEngine):
     def _nearby(self, dstates: int) -> Generator[list[int], None, bool]:
         """Answers, each from the one before. Returns whether these are all that was not excluded."""
 
-        def read(model: clingo.Model) -> list[int]:
+        def read(model: clingo.Model) -> tuple[int, ...]:
             self._transitive.failed = 0
             return self._labels(self._pairs(model))
 
-        avoided = [(atom, False) for atom in self._avoided.values()] if self._speedups.core_guided else []
         excluded = set(self._found[self._excluded :])
         self._transitive.asked, self._transitive.failed = True, 0
-        answers = self._answers(read, self._mode(dstates), 0, assumptions=avoided, until=lambda: self._transitive.failed > FAR)
+        answers = self._answers(read, self._mode(dstates), 0, assumptions=list(self._avoided), until=lambda: self._transitive.failed > FAR)
         try:
             while True:
                 try:
                     labels = next(answers)
                 except StopIteration as end:
                     return bool(end.value)
-                if tuple(labels) not in excluded:
-                    self._found.append(tuple(labels))
-                    yield labels
+                if labels not in excluded:
+                    self._found.append(labels)
+                    yield list(labels)
         finally:
             answers.close()
             self._transitive.asked = False
 
-    def _other(self, dstates: int) -> list[int] | None:
+    def _other(self, dstates: int) -> tuple[int, ...] | None:
         """An answer of so many dstates that was not excluded."""
-        avoided = list(self._avoided) if self._speedups.core_guided else []
         while True:
-            pairs, _ = self._without(avoided, mode=self._mode(dstates))
+            pairs, _ = self._verdict(self._pairs, list(self._avoided), mode=self._mode(dstates))
             if pairs is None:
                 return None
             if not (threes := self._intransitive(pairs)):
@@ -235,6 +227,12 @@ class SameEngine(ChartedEngine):
 
     def _mode(self, dstates: int) -> str:
         return "ignore" if self._speedups.core_guided else f"enum,{dstates}"
+
+    def _refuse(self, labels: Sequence[int]) -> None:
+        """Take back labels that turned out to be no answer."""
+        if (refused := tuple(labels)) in self._found:
+            self._excluded -= self._found.index(refused) < self._excluded
+            self._found.remove(refused)
 
     def _spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
         """Pairs that are the same if these nodes are at the dstates that they are labelled with."""
@@ -249,33 +247,25 @@ class SameEngine(ChartedEngine):
     def _intransitive(self, pairs: Sequence[Pair]) -> list[Three]:
         """Visits of which an answer, with what follows from it, does not hold that to be the same is transitive."""
         found: dict[Three, None] = {}
-        turned: dict[int, dict[int, int]] = {}  # slot 0 of a visit is which slot of the other
+        turned: _Turned = {}
         leaves = self._chart.leaves
         work = list(pairs)
-
-        def take(i: int, j: int, r: int) -> None:
-            if turned.setdefault(i, {}).setdefault(j, r) == r:
-                turned.setdefault(j, {})[i] = -r % 4
-
         for pair in pairs:
-            take(*pair)
+            _take(turned, pair)
         for i, j, r in work:
-            of_i, of_j = turned[i], turned[j]
-            joined = [(i, k, (r + q) % 4, j, r) for k, q in of_j.items() if k != i and of_i.get(k) != (r + q) % 4]
-            joined += [(j, k, (q - r) % 4, i, -r % 4) for k, q in of_i.items() if k != j and of_j.get(k) != (q - r) % 4]
             follows = [(i + 1, j + 1, 0)] if i in leaves and leaves.get(j) == ((leaves[i][0] + r) % 4, leaves[i][1]) else []
-            for first, last, turn, middle, half in joined:
+            for first, (middle, half), (last, turn) in _apart_yet_joined((i, j, r), turned):
                 found[_in_order((first, 0), (middle, half), (last, turn))] = None
                 follows.append(_pair(first, last, turn))
             for pair in follows:
                 if pair in self._fits and pair[1] not in turned.get(pair[0], ()):
-                    take(*pair)
+                    _take(turned, pair)
                     work.append(pair)
             if len(found) >= AT_A_TIME:
                 break
         return list(found)
 
-    def _labels(self, pairs: Iterable[Pair]) -> list[int]:
+    def _labels(self, pairs: Iterable[Pair]) -> tuple[int, ...]:
         """The dstate of each node in an answer that is transitive, numbered by the first node there."""
         first: dict[int, tuple[int, int]] = {}
         for i, j, r in sorted(pairs):
@@ -285,7 +275,7 @@ class SameEngine(ChartedEngine):
         for visit, slot in self._chart.facing:
             i, r = first.get(visit, (visit, 0))
             labels.append(number.setdefault((i, (slot - r) % 4), len(number)))
-        return labels
+        return tuple(labels)
 
 
 class _Transitive(clingo.Propagator):
@@ -297,7 +287,7 @@ class _Transitive(clingo.Propagator):
         self._program_literals = literals
         self._watched: dict[int, list[Pair]] = {}
         self._literals: dict[Pair, int] = {}
-        self._turned: dict[int, dict[int, int]] = {}
+        self._turned: _Turned = {}
 
     def init(self, init: clingo.PropagateInit) -> None:
         for literal in self._watched:
@@ -309,23 +299,21 @@ class _Transitive(clingo.Propagator):
             literal = self._literals[pair] = init.solver_literal(program_literal)
             self._watched.setdefault(literal, []).append(pair)
             if init.assignment.is_true(literal):
-                self._take(pair)
+                _take(self._turned, pair)
         for literal in self._watched:
             init.add_watch(literal)
 
     def propagate(self, control: clingo.PropagateControl, changes: Sequence[int]) -> None:
         pairs = [pair for literal in changes for pair in self._watched.get(literal, ())]
         for pair in pairs:
-            self._take(pair)
-        for i, j, r in pairs:
-            of_i, of_j = self._turned[i], self._turned[j]
-            joined = [(i, k, (r + q) % 4, j, q) for k, q in of_j.items() if k != i and of_i.get(k) != (r + q) % 4]
-            joined += [(j, k, (q - r) % 4, i, q) for k, q in of_i.items() if k != j and of_j.get(k) != (q - r) % 4]
-            for first, last, turn, middle, half in joined:
+            _take(self._turned, pair)
+        for pair in pairs:
+            for first, (middle, half), (last, turn) in _apart_yet_joined(pair, self._turned):
                 self.failed += 1
-                third = self._literals.get(_pair(first, last, turn))
-                clause = [-self._literals[i, j, r], -self._literals[_pair(middle, last, half)]]
-                if not control.add_clause(clause if third is None else [*clause, third], lock=True) or not control.propagate():
+                clause = [-self._literals[pair], -self._literals[_pair(middle, last, (turn - half) % 4)]]
+                if (third := self._literals.get(_pair(first, last, turn))) is not None:
+                    clause.append(third)
+                if not control.add_clause(clause, lock=True) or not control.propagate():
                     return
 
     def undo(self, thread: int, assignment: clingo.Assignment, changes: Sequence[int]) -> None:
@@ -334,10 +322,20 @@ class _Transitive(clingo.Propagator):
                 self._turned.get(i, {}).pop(j, None)
                 self._turned.get(j, {}).pop(i, None)
 
-    def _take(self, pair: Pair) -> None:
-        i, j, r = pair
-        self._turned.setdefault(i, {})[j] = r
-        self._turned.setdefault(j, {})[i] = -r % 4
+
+def _take(turned: _Turned, pair: Pair) -> None:
+    i, j, r = pair
+    turned.setdefault(i, {})[j] = r
+    turned.setdefault(j, {})[i] = -r % 4
+
+
+def _apart_yet_joined(pair: Pair, turned: _Turned) -> list[tuple[int, tuple[int, int], tuple[int, int]]]:
+    """Visits that are not the same though each is the same as a third, by this pair and another: the first one, the third
+    and the last, these two with the slot that slot 0 of the first one would be."""
+    i, j, r = pair
+    of_i, of_j = turned[i], turned[j]
+    joined = [(i, (j, r), (k, (r + q) % 4)) for k, q in of_j.items() if k != i and of_i.get(k) != (r + q) % 4]
+    return joined + [(j, (i, -r % 4), (k, (q - r) % 4)) for k, q in of_i.items() if k != j and of_j.get(k) != (q - r) % 4]
 
 
 def _pair(i: int, j: int, r: int) -> Pair:
