@@ -85,6 +85,7 @@ SUITE = {
         *(_maze(side, 6400) for side in (5, 6)),
         *(Instance(f"full rectangle n={8 * n}", _circuits(n), seeded=False) for n in (50, 50_000)),
         _maze(5, 1600, full=True),
+        _maze(10, 200, full=True),
         _maze(10, 4000, full=True),
         Instance("full taylor-hall", taylor_hall),
         Instance("full aces3", lambda _: aces3(), seeded=False),

@@ -268,14 +268,33 @@ def street_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
     turns = zip(pairwise(chart.node_of), trace.actions, strict=False)
     for s, x, turn in dict.fromkeys((s, x, action.turn) for (s, x), action in turns if action.turn):
         facts.append(f"around({s},{x})." if turn == "around" else f"bend({s},{turn},{x}).")
-    facts += ["sided."] if theory.boundary != "none" else []
-    facts += ["symmetric."] if theory.symmetric_sides else []
-    return "\n".join(facts)
+    return "\n".join([*facts, *_side_axioms(theory)])
 
 
-def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int]) -> str:
-    """The dstate of each node, what is open from it, and what is preferred, as facts for the least streets."""
-    facts = [settled_labels(labels)]
+def _side_axioms(theory: Theory) -> list[str]:
+    return [*(["sided."] if theory.boundary != "none" else []), *(["symmetric."] if theory.symmetric_sides else [])]
+
+
+def side_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
+    """How the robot turned on each visit, as facts for sides.lp."""
+    facts = []
+    for (s, x), action in zip(pairwise(chart.node_of), trace.actions, strict=False):
+        (visit, slot), (_, faced) = chart.facing[s], chart.facing[x]
+        if action.turn:
+            facts.append(f"{'about' if action.turn == 'around' else 'turns'}({visit},{slot},{faced}).")
+    return "\n".join([*dict.fromkeys(facts), *_side_axioms(theory)])
+
+
+def read_contrary(model: Model) -> tuple[list[int], list[int]]:
+    """Dstates whose streets show that they have none, shortest streets first; and dstates where streets cross that meet again."""
+    atoms = list(map(_atom, model.symbols(shown=True)))
+    contrary = sorted((args[1], args[0]) for name, args in atoms if name == "contrary")
+    return [dstate for _, dstate in contrary], sorted(args[0] for name, args in atoms if name == "twice")
+
+
+def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int]) -> str:
+    """The dstates of these nodes, what is open from dstates, and what is preferred, as facts for the least streets."""
+    facts = [settled_labels((node, labels[node]) for node in nodes)]
     for label, node in {label: node for node, label in enumerate(labels)}.items():  # any node of a dstate sees the same star
         visit, slot = chart.facing[node]
         star = chart.stars[visit]
@@ -289,9 +308,9 @@ def read_elsewhere(model: Model) -> set[tuple[int, int]]:
     return {(x, y) for _, (x, y) in map(_atom, model.symbols(shown=True))}
 
 
-def settled_labels(labels: Iterable[int]) -> str:
-    """The dstate of each node, as facts."""
-    return "\n".join(f"is({node},{label})." for node, label in enumerate(labels))
+def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
+    """Nodes and their dstates, as facts."""
+    return "\n".join(f"is({node},{label})." for node, label in labels)
 
 
 def open_labels(labels: Sequence[int]) -> str:

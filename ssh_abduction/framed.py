@@ -6,8 +6,9 @@ but not the order of places on a path, or its sides. For what that leaves of the
 
 *Claim.* Cut to its dstates, a map of the full theory is an answer of same.lp. So the fewest dstates of the latter are a lower bound, and
 if some answer of that cost has streets, all minimal maps are among the answers of that cost with their least streets.
-*If none has*, streets.lp is asked which labels clash: smallest sets of nodes at dstates that no streets fit. same.lp is told that these
-do not go together, and asked again. As every map of the full theory keeps that, its bounds still hold.
+*If none has*, streets.lp is asked which street shows it, and sides.lp says for that street what order and sides demand of the visits
+that are one. If no single street does, or visits are too many for that, streets.lp is asked which labels clash: smallest sets of nodes at
+dstates that no streets fit; same.lp is told that these do not go together. As every map of the full theory keeps that, bounds still hold.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
 CLASHES = 30  # that clingo is told of in one go
+MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much to say: some forty rules for each of them
 # clasp's way to list answers in which no atom that is shown can be spared:
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 BETTERING = 20_000  # conflicts after which better streets are no longer sought one after another
@@ -47,6 +49,7 @@ class FramedEngine(SameEngine):
 
     def _take(self, size: int) -> None:
         self._best = None
+        self._said: set[tuple[str, tuple[int, ...]]] = set()  # program parts of sides.lp
         try:
             super()._take(size)
         except NoFrame:
@@ -119,13 +122,7 @@ class FramedEngine(SameEngine):
 
     def _streets(self, labels: Sequence[int], mode: str, conflicts: int = -1, options: Sequence[str] = ()) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
-        began = time.perf_counter()
-        control = self._streets_of(self._chart, options)
-        control.load(encodings.path("preference"))
-        control.add("base", [], facts.settled_facts(self._theory, self._chart, labels))
-        control.ground([("base", []), ("least", [])])
-        self._watch.check()
-        self.ground_seconds += time.perf_counter() - began
+        control = self._street_control(labels, range(len(labels)), options)
         dstates = len(set(labels))
 
         def read(model: clingo.Model) -> Found:
@@ -133,9 +130,22 @@ class FramedEngine(SameEngine):
 
         return (yield from self._answers(read, mode, int(mode == "ignore"), control=control, conflicts=conflicts))
 
+    def _street_control(self, labels: Sequence[int], nodes: Sequence[int], options: Sequence[str] = ()) -> clingo.Control:
+        """A control for the streets that fit the labels of these nodes."""
+        began = time.perf_counter()
+        control = self._streets_of(self._chart, options)
+        control.load(encodings.path("preference"))
+        control.add("base", [], facts.settled_facts(self._theory, self._chart, labels, nodes))
+        control.ground([("base", []), ("least", [])])
+        self._watch.check()
+        self.ground_seconds += time.perf_counter() - began
+        return control
+
     def _forbid(self, labels: Sequence[int]) -> None:
-        """Tell clingo which of these labels do not go together."""
+        """Tell clingo why there are no streets for these labels."""
         self._refuse(labels)
+        if self._speedups.sides and len(self._fits) <= MANY_PAIRS and self._say_street(labels):
+            return
         rules = []
         for clash in self._clashing(labels):
             self.clashes += 1
@@ -144,18 +154,66 @@ class FramedEngine(SameEngine):
             rules.append(facts.forbidden_pairs(self._spanning(labels, clash), different))
         self._tell("\n".join(rules))
 
+    def _say_street(self, labels: Sequence[int]) -> bool:
+        """Say what order and sides demand of a street that these labels contradict. False if all such streets have been told of."""
+        control = self._streets_of(self._chart)
+        control.add("base", [], facts.settled_labels(enumerate(labels)))
+        control.ground([("base", []), ("contrary", [])])
+        contrary, twice = next(iter(self._answers(facts.read_contrary, "ignore", 1, control=control)))
+        stand = {label: self._chart.facing[node] for node, label in enumerate(labels)}
+        if any(self._say("street", *stand[dstate]) for dstate in contrary):
+            return True
+        for visit in (stand[dstate][0] for dstate in twice):
+            if any([self._say("street", visit, 0), self._say("street", visit, 1), self._say("crossing", visit)]):
+                return True
+        return False
+
+    def _say(self, part: str, *arguments: int) -> bool:
+        """Ground a part of sides.lp. False if it was before."""
+        if (part, arguments) in self._said:
+            return False
+        began = time.perf_counter()
+        if not self._said:
+            self._control.load(encodings.path("sides"))
+            self._control.add("streets", [], facts.side_facts(self._trace, self._theory, self._chart))
+            self._control.ground([("streets", [])])
+        self._control.ground([(part, facts.numbers(*arguments))])
+        self._said.add((part, arguments))
+        self.ground_seconds += time.perf_counter() - began
+        return True
+
     def _clashing(self, labels: Sequence[int]) -> list[list[int]]:
         """Sets of nodes whose labels no streets fit, of none of which a node can be spared: CLASHES of them at most."""
         control = self._streets_of(self._chart, SMALLEST)
         control.add("base", [], facts.open_labels(labels))
         control.ground([("base", [])])
-        return list(self._answers(lambda model: sorted(facts.read_names(model)), "ignore", CLASHES, control=control))
+        clashes = list(self._answers(lambda model: sorted(facts.read_names(model)), "ignore", CLASHES, control=control))
+        return clashes or [self._clash(labels)]
+
+    def _clash(self, labels: Sequence[int]) -> list[int]:
+        """One such set, where it takes the choices of streets.lp to see that there are no streets: nodes are left out while there are none."""
+        nodes = list(range(len(labels)))
+        size = len(nodes)
+        while size := size // 2:
+            start = 0
+            while start < len(nodes) and len(nodes) > 1:
+                fewer = nodes[:start] + nodes[start + size :]
+                if self._has_streets(labels, fewer):
+                    start += size
+                else:
+                    nodes = fewer
+        return nodes
+
+    def _has_streets(self, labels: Sequence[int], nodes: Sequence[int]) -> bool:
+        """Whether some streets fit the labels of these nodes."""
+        control = self._street_control(labels, nodes)
+        return next(iter(self._answers(lambda _: True, "ignore", 1, control=control)), False)
 
     def _charted(self, size: int) -> FramedChart:
         """The nodes, and which of them are at different places because of what the trace alone says of order and sides."""
         chart = Chart.framed(self._trace, self._log, size)
         control = self._streets_of(chart)
-        control.add("base", [], facts.settled_labels(range(len(chart.seen))))
+        control.add("base", [], facts.settled_labels((node, node) for node in range(len(chart.seen))))
         control.ground([("base", []), ("apart", [])])
         self._watch.check()
         return next((replace(chart, elsewhere=pairs) for pairs in self._answers(facts.read_elsewhere, "ignore", 1, control=control)), chart)

@@ -61,7 +61,7 @@ class SameEngine(ChartedEngine):
         order = [*self.clique, *sorted(set(range(len(apart))) - set(self.clique), key=lambda node: (-int(apart[node].sum()), node))]
         self._fits = frozenset(chart.fits())
         self._watch.check(SECONDS_A_PAIR * len(self._fits))
-        self._control = clingo.Control(["--warn=none"])
+        self._control = clingo.Control(["--warn=none", "--heuristic=Domain"])
         self._control.load(encodings.path("same"))
         self._control.add("base", [], facts.visit_facts(chart, order, self._fits))
         self._control.ground([("base", [])])

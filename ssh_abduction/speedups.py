@@ -21,6 +21,7 @@ class Speedups:
     lazy         with names: give clingo only the links that replaying contradicts
     core_guided  with names or frames: raise the bound from below, rather than better the map
     small_cores  with frames: make cores smaller, as long as that is cheap
+    sides        with frames: say what order and sides forbid while dstates are sought, street by street
     one_by_one   with names: where that stalls, ask for numbers of dstates one by one
     greedy       some map without a search, for a time limit that leaves no other
     """
@@ -34,6 +35,7 @@ class Speedups:
     lazy: bool = True
     core_guided: bool = True
     small_cores: bool = True
+    sides: bool = True
     one_by_one: bool = True
     greedy: bool = True
 
