@@ -164,6 +164,11 @@ class Engine:
         """The size to grow to when the maps of the prefix do not explain step `failed`."""
         return min(len(self._trace), max(failed + 1, int(self.size * GROWTH)))
 
+    @property
+    def size_to_go_on(self) -> int:
+        """The size to grow to first when a search was stopped and the trace has grown since."""
+        return self.size
+
     def with_paths(self, paths: int) -> Engine:
         """Another engine, still for the empty prefix, with so many names for paths."""
         raise NotImplementedError
@@ -250,7 +255,10 @@ class Engine:
                 result = handle.get()
                 if result.interrupted and conflicts < 0:
                     raise Stopped("interrupted")
-                return None, handle.core() if result.unsatisfiable else None
+                if not result.unsatisfiable:
+                    return None, None
+                known = set(assumed)
+                return None, [literal for literal in handle.core() if literal in known]  # external atoms are assumed, too
             finally:
                 handle.cancel()
                 self.solve_seconds += time.perf_counter() - began
@@ -327,6 +335,10 @@ class ChartedEngine(Engine):
         if self.size < FIRST_PREFIXES:
             return min(steps, max(failed + 1, FIRST_PREFIXES))
         return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * self.size, AT_ONCE))
+
+    @property
+    def size_to_go_on(self) -> int:
+        return self.next_size(self.size)
 
     def grow(self, size: int) -> None:
         if size == self.size:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 
-from clingo import Control, Function, Model, Number, String, Symbol, SymbolicAtom, SymbolType
+from clingo import Function, Model, Number, String, Symbol, SymbolType
 
 from ssh_abduction.chart import FramedChart
 from ssh_abduction.maps import DState, Path, SSHMap
@@ -201,18 +201,26 @@ def read_names(model: Model) -> dict[int, int]:
     return {s.arguments[0].number: s.arguments[1].number for s in model.symbols(shown=True)}
 
 
-def visit_facts(chart: FramedChart, order: Iterable[int], fits: Iterable[tuple[int, int, int]]) -> str:
-    """Visits that may be one, where each ends, and its nodes, numbered in that order."""
-    facts = [f"node({place},{visit},{slot})." for place, node in enumerate(order) for visit, slot in (chart.facing[node],)]
-    facts += [f"leaves({visit},{slot},{action})." for visit, (slot, action) in chart.leaves.items()]
-    facts += [f"fits({i},{j},{r})." for i, j, r in fits]
-    return "\n".join(facts)
+def visit_facts(
+    batch: int,
+    nodes: Iterable[tuple[int, int, int]],
+    leaves: Iterable[tuple[int, int, int]],
+    fits: Iterable[tuple[int, int, int]],
+    unfit: Iterable[tuple[int, int, int]] = (),
+) -> str:
+    """What is new of visits: numbered nodes with visit and slot, where visits end and how, which pairs may be one, and which no longer."""
+    new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit}
+    return "\n".join(f"{name}({batch},{','.join(map(str, args))})." for name, rows in new.items() for args in rows)
 
 
-def pair_atoms(control: Control) -> dict[tuple[int, int, int], SymbolicAtom]:
-    """The atoms of same.lp that two visits are the same, by visits and how they are turned."""
-    atoms = control.symbolic_atoms.by_signature("same", 3)
-    return {(i.number, j.number, r.number): atom for atom in atoms for i, j, r in (atom.symbol.arguments,)}
+def same(pair: tuple[int, int, int]) -> Symbol:
+    """The atom that two visits are the same, so turned."""
+    return Function("same", numbers(*pair))
+
+
+def listed(batch: int) -> Symbol:
+    """The external atom that answers for the batches up to this one are listed."""
+    return Function("listed", [Number(batch)])
 
 
 def alone(place: int) -> Symbol:
@@ -240,9 +248,12 @@ def three_facts(batch: int, threes: Iterable[tuple[int, ...]]) -> str:
     return "\n".join(f"via({batch},{','.join(map(str, three))})." for three in threes)
 
 
-def forbidden_pairs(same: Iterable[tuple[int, int, int]], different: Iterable[tuple[int, int, int]] = ()) -> str:
-    """The rule that these pairs of visits are not all the same while those are not."""
-    return f":- {', '.join([*(f'same({i},{j},{r})' for i, j, r in same), *(f'not same({i},{j},{r})' for i, j, r in different)])}."
+def forbidden_pairs(
+    pairs: Iterable[tuple[int, int, int]], different: Iterable[tuple[int, int, int]] = (), listed: int | None = None
+) -> str:
+    """The rule that these pairs of visits are not all the same while those are not; only while answers up to a batch are listed, if given."""
+    body = [*(f"same({i},{j},{r})" for i, j, r in pairs), *(f"not same({i},{j},{r})" for i, j, r in different)]
+    return f":- {', '.join(body if listed is None else [f'listed({listed})', *body])}."
 
 
 def numbers(*arguments: int) -> list[Symbol]:
@@ -275,14 +286,15 @@ def _side_axioms(theory: Theory) -> list[str]:
     return [*(["sided."] if theory.boundary != "none" else []), *(["symmetric."] if theory.symmetric_sides else [])]
 
 
-def side_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
-    """How the robot turned on each visit, as facts for sides.lp."""
-    facts = []
-    for (s, x), action in zip(pairwise(chart.node_of), trace.actions, strict=False):
-        (visit, slot), (_, faced) = chart.facing[s], chart.facing[x]
-        if action.turn:
-            facts.append(f"{'about' if action.turn == 'around' else 'turns'}({visit},{slot},{faced}).")
-    return "\n".join([*dict.fromkeys(facts), *_side_axioms(theory)])
+def side_facts(theory: Theory) -> str:
+    """What of the sides of paths holds in a theory, as facts for sides.lp."""
+    return "\n".join(_side_axioms(theory))
+
+
+def turn_facts(batch: int, visits: Iterable[int], turns: Iterable[tuple[int, int, int, str]]) -> str:
+    """New visits, and how the robot turned on a visit, from slot to slot, as facts for sides.lp."""
+    new = [f"{'about' if turn == 'around' else 'turns'}({batch},{visit},{slot},{faced})." for visit, slot, faced, turn in turns]
+    return "\n".join([*(f"visit({batch},{visit})." for visit in visits), *new])
 
 
 def read_contrary(model: Model) -> tuple[list[int], list[int]]:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import clingo
@@ -25,7 +25,7 @@ from ssh_abduction import encodings, facts
 from ssh_abduction.chart import Chart, FramedChart, NoFrame
 from ssh_abduction.engine import Found, Watch
 from ssh_abduction.replay import Log
-from ssh_abduction.same import SameEngine
+from ssh_abduction.same import Pair, SameEngine
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
@@ -34,7 +34,16 @@ CLASHES = 30  # that clingo is told of in one go
 MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much to say: some forty rules for each of them
 # clasp's way to list answers in which no atom that is shown can be spared:
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
+KEPT = 10  # controls of minimal namings that are kept until their maps are listed: each is some megabytes
 BETTERING = 20_000  # conflicts after which better streets are no longer sought one after another
+
+
+@dataclass(frozen=True)
+class _Naming:
+    """The dstate of each node, and a control for its streets, unless one is to be taken anew."""
+
+    labels: list[int]
+    control: clingo.Control | None
 
 
 class FramedEngine(SameEngine):
@@ -45,15 +54,16 @@ class FramedEngine(SameEngine):
         self.paths = len(trace)  # names for paths are never short
         self._framed = True  # whether the visits fit their frames
         self.clashes = 0  # sets of nodes whose dstates were found to have no streets
-        self._best: tuple[tuple[int, ...], list[list[int]]] | None = None  # the minimal cost, and all namings that have it
+        self._best: tuple[tuple[int, ...], list[_Naming]] | None = None  # the minimal cost, and all namings that have it
 
-    def _take(self, size: int) -> None:
-        self._best = None
-        self._said: set[tuple[str, tuple[int, ...]]] = set()  # program parts of sides.lp
+    def grow(self, size: int) -> None:
+        if size != self.size:
+            self._best = None
         try:
-            super()._take(size)
+            super().grow(size)
         except NoFrame:
             self._framed = False
+            self.size = size
 
     def improving_maps(self) -> Iterator[Found]:
         if not self._framed:
@@ -61,7 +71,8 @@ class FramedEngine(SameEngine):
         best: Found | None = None
         labels = self._minimal_labels()
         while labels is not None:
-            for best in self._better_streets(labels):
+            named = _Naming(labels, self._street_control(labels, range(len(labels))))
+            for best in self._better_streets(named):
                 yield best
             if best is not None:
                 break
@@ -69,28 +80,28 @@ class FramedEngine(SameEngine):
             labels = self._minimal_labels()
         if best is None or labels is None:
             return
-        namings = [labels]
-        for others in self._fitting(best.cost[0], besides=labels):
-            for found in self._better_streets(others):
+        namings = [named]
+        for other in self._fitting(best.cost[0], besides=labels):
+            for found in self._better_streets(other):
                 if found.cost < best.cost:
                     best, namings = found, []
                     yield best
             if found.cost == best.cost:
-                namings.append(others)
+                namings.append(other if len(namings) < KEPT else replace(other, control=None))
         self._best = best.cost, namings
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         if not self._framed:
             return
         count = 0
-        for labels in self._best[1] if self._best and self._best[0] == cost else self._fitting(cost[0]):
-            for found in self._streets(labels, f"enum,{','.join(map(str, (0, *cost[1:])))}"):
+        for naming in self._best[1] if self._best and self._best[0] == cost else self._fitting(cost[0]):
+            for found in self._streets(naming, f"enum,{','.join(map(str, (0, *cost[1:])))}"):
                 yield found
                 count += 1
                 if count == enough:
                     return
 
-    def _fitting(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[list[int]]:
+    def _fitting(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[_Naming]:
         """All ways to be at so many dstates that have streets, each once, and not that one."""
         known = {tuple(besides)}
         while True:
@@ -99,30 +110,33 @@ class FramedEngine(SameEngine):
                 for labels in all_labels:
                     if tuple(labels) in known:
                         continue
-                    if next(self._streets(labels, "ignore"), None) is None:
+                    naming = _Naming(labels, self._street_control(labels, range(len(labels))))
+                    if next(self._streets(naming, "ignore"), None) is None:
                         refused = labels
                         break
                     known.add(tuple(labels))
-                    yield labels
+                    yield naming
             if refused is None:
                 return
             self._forbid(refused)
 
-    def _better_streets(self, labels: Sequence[int]) -> Iterator[Found]:
+    def _better_streets(self, naming: _Naming) -> Iterator[Found]:
         """Maps with these dstates, each as good as the one before or better, the last one best; none if no streets fit them.
 
         Where bettering maps does not end soon, the bound is raised from below instead.
         """
         if len(self._theory.priorities) == 1:
-            yield from self._streets(labels, "ignore")
+            yield from self._streets(naming, "ignore")
             return
-        proven = yield from self._streets(labels, "opt", BETTERING)
+        proven = yield from self._streets(naming, "opt", BETTERING)
         if not proven:
-            yield from self._streets(labels, "opt", options=["--opt-strategy=usc"])
+            control = self._street_control(naming.labels, range(len(naming.labels)), ["--opt-strategy=usc"])
+            yield from self._streets(replace(naming, control=control), "opt")
 
-    def _streets(self, labels: Sequence[int], mode: str, conflicts: int = -1, options: Sequence[str] = ()) -> Generator[Found, None, bool]:
+    def _streets(self, naming: _Naming, mode: str, conflicts: int = -1) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
-        control = self._street_control(labels, range(len(labels)), options)
+        labels = naming.labels
+        control = naming.control or self._street_control(labels, range(len(labels)))
         dstates = len(set(labels))
 
         def read(model: clingo.Model) -> Found:
@@ -161,26 +175,41 @@ class FramedEngine(SameEngine):
         control.ground([("base", []), ("contrary", [])])
         contrary, twice = next(iter(self._answers(facts.read_contrary, "ignore", 1, control=control)))
         stand = {label: self._chart.facing[node] for node, label in enumerate(labels)}
-        if any(self._say("street", *stand[dstate]) for dstate in contrary):
+        if any(self._say_once("street", *stand[dstate]) for dstate in contrary):
             return True
         for visit in (stand[dstate][0] for dstate in twice):
-            if any([self._say("street", visit, 0), self._say("street", visit, 1), self._say("crossing", visit)]):
+            said = [self._say_once("street", visit, 0), self._say_once("street", visit, 1), self._say_once("crossing", visit, self._batch)]
+            if any(said):
                 return True
         return False
 
-    def _say(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides.lp. False if it was before."""
+    def _say_once(self, part: str, *arguments: int) -> bool:
+        """Ground a part of sides.lp, unless it was before. Returns whether it was not."""
         if (part, arguments) in self._said:
             return False
         began = time.perf_counter()
+        batches = range(self._batch + 1)
         if not self._said:
             self._control.load(encodings.path("sides"))
-            self._control.add("streets", [], facts.side_facts(self._trace, self._theory, self._chart))
-            self._control.ground([("streets", [])])
-        self._control.ground([(part, facts.numbers(*arguments))])
-        self._said.add((part, arguments))
+            self._control.add("sides", [], facts.side_facts(self._theory))
+            self._control.ground([("sides", []), *(("streets", facts.numbers(batch)) for batch in batches)])
+        self._said[part, arguments] = None
+        if part == "street":
+            self._control.ground([(part, facts.numbers(*arguments, batch)) for batch in batches])
+        else:
+            self._control.ground([(part, facts.numbers(*arguments))])
         self.ground_seconds += time.perf_counter() - began
         return True
+
+    def _begin(self, chart: FramedChart) -> None:
+        super()._begin(chart)
+        self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # parts of sides.lp
+
+    def _give(self, chart: FramedChart, order: Sequence[int], fits: frozenset[Pair]) -> None:
+        super()._give(chart, order, fits)
+        if self._said:
+            streets = [(part, facts.numbers(*arguments, self._batch)) for part, arguments in self._said if part == "street"]
+            self._control.ground([("streets", facts.numbers(self._batch)), *streets])
 
     def _clashing(self, labels: Sequence[int]) -> list[list[int]]:
         """Sets of nodes whose labels no streets fit, of none of which a node can be spared: CLASHES of them at most."""

@@ -27,7 +27,7 @@ When time is short
 ------------------
 A map that predicts the step is minimal even if there is no time to look for others. Once there is none, the answer is feasible: a map that
 was found and goes on predicting, or else the sketch (`sketch.py`), with the last bound, which holds for the longer trace by (1). clingo is
-asked again when the trace is longer by RETRY; it goes on where it was stopped, and may prove a map minimal again.
+asked again when the trace is longer by RETRY and PAUSE; it goes on where it was stopped, and may prove a map minimal again.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ from ssh_abduction.solver import Cost, Search, Seconds, Solution, Status
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Step, Trace, View
 
-RETRY = 1.25  # after a search that was stopped, the trace grows by this factor before the next, so that few steps are slow
+RETRY = 1.02  # after a search that was stopped, the trace grows by this factor before the next, so that few steps are slow,
+PAUSE = 3  # and by so many steps at least
 
 
 class OnlineMapper:
@@ -154,7 +155,8 @@ class OnlineMapper:
         search = Search(self.trace, self.theory, limit=self._limit, maps=self._most, after=self._search, minimal=known)
         found = tuple(search)
         self._search = search
-        self._next_search = int(len(self._steps) * RETRY) if search.stopped in ("time limit", "interrupted") else 0
+        steps = len(self._steps)
+        self._next_search = max(steps + PAUSE, int(RETRY * steps)) if search.stopped in ("time limit", "interrupted") else 0
         self._asked = search.solution()
         cost = self._asked.cost
         if search.status in (Status.OPTIMAL, Status.UNSATISFIABLE) or self._is_better(cost):

@@ -4,7 +4,8 @@ Names are poor knowledge where many dstates are known from few visits: what is l
 the next, and each is a choice for nodes all over the world. That two visits are the same is only about these two. A node is
 *alone* if no node before it, in an order of choice, is at its dstate; there are as many dstates as lone nodes.
 
-*Order.* A clique of nodes that are apart comes first, then what fits few others.
+*Order.* A clique of nodes that are apart comes first, then what fits few others; what is new when the trace grows comes last, so what
+clingo was told and what it learned still holds.
 
 *Transitive.* That I is J and J is K, so I is K, is said only of visits where an answer fails to hold it: there are some millions of
 threes. Until no answer fails, what clingo solves is a relaxation, so its bounds hold.
@@ -19,20 +20,24 @@ fails to be transitive is a call. Cores are made small as long as that is cheap:
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterable, Mapping, Sequence
-from typing import TypeAlias
+from collections.abc import Generator, Iterable, Sequence
+from dataclasses import replace
+from typing import Self, TypeAlias
 
 import clingo
 
 from ssh_abduction import encodings, facts
 from ssh_abduction.apart import clique
-from ssh_abduction.chart import FramedChart
-from ssh_abduction.engine import ChartedEngine
+from ssh_abduction.chart import Chart, FramedChart
+from ssh_abduction.engine import ChartedEngine, Watch
+from ssh_abduction.replay import Log
+from ssh_abduction.trace import Trace
 
 SECONDS_A_PAIR = 3e-5  # what clingo takes, about, to ground two visits that may be one: it cannot be stopped meanwhile
 AT_A_TIME = 20_000  # threes of visits that clingo is told of in one go
 TRIES = 100  # conflicts after which it is left open whether a core can be smaller
 FAILED_TRIES = 20  # tries after which a core is kept as it is
+GROWN = 1.1  # how many times as many nodes as at first a control may have, before a new one is taken with a better order
 MANY = 5  # answers found one by one, after which they are looked for nearby
 FAR = 200  # failures to be transitive after which an answer is not nearby
 
@@ -46,39 +51,91 @@ class SameEngine(ChartedEngine):
 
     _chart: FramedChart
 
+    def over(self, trace: Trace, watch: Watch, log: Log) -> Self:
+        self._trace, self._watch, self._log = trace, watch, log
+        self.ground_seconds = self.solve_seconds = 0.0
+        return self
+
     def _charted(self, size: int) -> FramedChart:
         """The nodes and visits of the first steps."""
         raise NotImplementedError
 
-    def _take(self, size: int) -> None:
-        """Chart the first steps, and take a control for their visits."""
+    def grow(self, size: int) -> None:
+        """Chart the first steps, and tell clingo what is new of their visits; in a new control if that is much."""
+        if size == self.size:
+            return
         began = time.perf_counter()
+        grown = self.size > 0
+        if grown:
+            chart = replace(Chart.framed(self._trace, self._log, size), elsewhere=self._chart.elsewhere)
+            grown = len(chart.seen) <= GROWN * self._first_nodes
+        if grown:
+            order = list(range(len(self._chart.seen), len(chart.seen)))
+        else:
+            chart = self._charted(size)
+            apart = chart.apart(len(chart.seen))
+            self._watch.check()
+            self.clique = clique(apart, chart.seen) if self._speedups.clique else []
+            order = [*self.clique, *sorted(set(range(len(apart))) - set(self.clique), key=lambda node: (-int(apart[node].sum()), node))]
+        fits = frozenset(chart.fits())
+        self._watch.check(SECONDS_A_PAIR * len(fits - self._fits if grown else fits))
+        self.size = 0  # until clingo was told all of it
+        if not grown:
+            self._begin(chart)
+        self._give(chart, order, fits)
         self.size = size
-        chart = self._chart = self._charted(size)
-        apart = chart.apart(len(chart.seen))
-        self._watch.check()
-        self.clique = clique(apart, chart.seen) if self._speedups.clique else []
-        order = [*self.clique, *sorted(set(range(len(apart))) - set(self.clique), key=lambda node: (-int(apart[node].sum()), node))]
-        self._fits = frozenset(chart.fits())
-        self._watch.check(SECONDS_A_PAIR * len(self._fits))
+        self.ground_seconds += time.perf_counter() - began
+
+    def _begin(self, chart: FramedChart) -> None:
+        """Take a control that knows nothing."""
+        self._first_nodes = len(chart.seen)
         self._control = clingo.Control(["--warn=none", "--heuristic=Domain"])
         self._control.load(encodings.path("same"))
-        self._control.add("base", [], facts.visit_facts(chart, order, self._fits))
-        self._control.ground([("base", [])])
-        alone = [self._control.symbolic_atoms[facts.alone(place)] for place in range(len(order))]
-        unsure = {-atom.literal: atom.symbol for atom in alone if atom and not atom.is_fact}
-        self._least = len(order) - len(unsure)
-        self._avoided = unsure if self._speedups.core_guided else {}  # what is assumed not to be there, by the literal of that
-        self._raise_bound()
-        atoms = facts.pair_atoms(self._control)
-        self._pair_of = {atom.symbol: pair for pair, atom in atoms.items()}
-        self._transitive = _Transitive({pair: atom.literal for pair, atom in atoms.items()})
+        self._batch = -1
+        self._nodes = self._visits = 0  # so many clingo knows
+        self._ends: set[int] = set()  # visits of which it knows the end
+        self._turns: set[tuple[int, int, int, str]] = set()
+        self._fits: frozenset[Pair] = frozenset()
+        self._least = 0
+        self._avoided: dict[int, clingo.Symbol] = {}  # what is assumed not to be there, by the literal of that
+        self._pair_of: dict[clingo.Symbol, Pair] = {}
+        self._transitive = _Transitive()
         self._control.register_propagator(self._transitive)
         self._core_sizes: list[int] = []
+        self._parts = 0
+
+    def _give(self, chart: FramedChart, order: Sequence[int], fits: frozenset[Pair]) -> None:
+        """Tell clingo what it does not know yet of a chart. New nodes come after the others in the order of choice."""
+        if self._batch >= 0:
+            self._control.release_external(facts.listed(self._batch))
+        self._chart = chart
+        self._batch += 1
+        nodes = [(place, *chart.facing[node]) for place, node in enumerate(order, self._nodes)]
+        leaves = [(visit, *how) for visit, how in chart.leaves.items() if visit not in self._ends]
+        turns = [turn for turn in chart.turns(self._trace) if turn not in self._turns]
+        new = sorted(fits - self._fits)
+        told = facts.visit_facts(self._batch, nodes, leaves, new, sorted(self._fits - fits))
+        self._control.add(f"visits_{self._batch}", [], told)
+        self._control.add(f"visits_{self._batch}", [], facts.turn_facts(self._batch, range(self._visits, len(chart.stars)), turns))
+        self._control.ground([(f"visits_{self._batch}", []), ("more", facts.numbers(self._batch))])
+        self._control.assign_external(facts.listed(self._batch), True)
+        self._nodes, self._visits, self._fits = len(chart.seen), len(chart.stars), fits
+        self._ends.update(visit for visit, *_ in leaves)
+        self._turns.update(turns)
+        atoms = self._control.symbolic_atoms
+        for place, *_ in nodes:
+            atom = atoms[facts.alone(place)]
+            if atom and (atom.is_fact or not self._speedups.core_guided):
+                self._least += atom.is_fact
+            elif atom:
+                self._avoided[-atom.literal] = atom.symbol
+        self._raise_bound()
+        for pair in new:
+            if atom := atoms[facts.same(pair)]:
+                self._pair_of[atom.symbol] = pair
+                self._transitive.literals[pair] = atom.literal
         self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
         self._excluded = 0  # so many of them clingo will not find again
-        self._parts = 0
-        self.ground_seconds += time.perf_counter() - began
 
     def _raise_bound(self) -> None:
         self.bound = max(self.bound or 0, self._least)
@@ -178,8 +235,8 @@ class SameEngine(ChartedEngine):
         yield from map(list, self._found)
         asked = 0
         while True:
-            known = [facts.forbidden_pairs(self._spanning(found, range(len(found)))) for found in self._found[self._excluded :]]
-            self._tell("\n".join(known))
+            known = [self._spanning(found, range(len(found))) for found in self._found[self._excluded :]]
+            self._tell("\n".join(facts.forbidden_pairs(pairs, listed=self._batch) for pairs in known))
             self._excluded = len(self._found)
             labels = self._other(dstates)
             if labels is None:
@@ -281,10 +338,10 @@ class SameEngine(ChartedEngine):
 class _Transitive(clingo.Propagator):
     """A propagator for when all answers are wanted: few conflicts, and each answer has to be transitive."""
 
-    def __init__(self, literals: Mapping[Pair, int]) -> None:
+    def __init__(self) -> None:
         self.asked = False
         self.failed = 0  # how often not, since this was set to 0
-        self._program_literals = literals
+        self.literals: dict[Pair, int] = {}  # of the program
         self._watched: dict[int, list[Pair]] = {}
         self._literals: dict[Pair, int] = {}
         self._turned: _Turned = {}
@@ -295,7 +352,7 @@ class _Transitive(clingo.Propagator):
         self._watched, self._turned = {}, {}
         if not self.asked:
             return
-        for pair, program_literal in self._program_literals.items():
+        for pair, program_literal in self.literals.items():
             literal = self._literals[pair] = init.solver_literal(program_literal)
             self._watched.setdefault(literal, []).append(pair)
             if init.assignment.is_true(literal):

@@ -270,7 +270,7 @@ class Search:
             self._engine = self._engine.with_paths(self._engine.paths)
         if not self._whole:
             self.bound, self._lower = after.bound, after._lower
-            self._start = len(trace) if after.status is Status.OPTIMAL else max(FIRST_PREFIX, self.prefix)
+            self._start = len(trace) if after.status is Status.OPTIMAL else max(FIRST_PREFIX, self._engine.size_to_go_on)
         if minimal is not None:
             self.status, self.best, self._cost = Status.OPTIMAL, minimal, after._cost
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import STARS
 
-from ssh_abduction import Search, Speedups, Status, Theory, Trace, encodings, engine, facts, framed, same, solve, solver
+from ssh_abduction import OnlineMapper, Search, Speedups, Status, Theory, Trace, encodings, engine, facts, framed, same, solve, solver
 from ssh_abduction.chart import QUARTERS, Chart, FramedChart, NoFrame
 from ssh_abduction.checker import check
 from ssh_abduction.engine import Stopped
@@ -106,6 +106,48 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         assert [getattr(found.cost, name) for name in theory.prefer] == [getattr(expected.cost, name) for name in theory.prefer]
     for ssh_map in maps[:3]:
         assert check(trace, ssh_map, theory) == ()
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(framed_traces(), framed_theories(), st.data())
+def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, data: st.DataObject) -> None:
+    """Whether clingo is told what is new, or all of it anew."""
+    grown = data.draw(st.sampled_from([1, 1.5, 100]), label="grown")
+    charted = data.draw(st.sampled_from([FramedEngine._charted, plainly_charted]), label="charted")
+    first, *rest = trace.steps
+    with (
+        patch.object(solver, "FEW_STEPS", 0),
+        patch.multiple(same, GROWN=grown, MANY=data.draw(st.sampled_from([1, same.MANY]), label="many")),
+        patch.object(FramedEngine, "_charted", charted),
+    ):
+        mapper = OnlineMapper(first.view or "", theory, star=first.star, limit=None, maps=0)
+        for i, (action, step) in enumerate(zip(trace.actions, rest, strict=True)):
+            answer = mapper.observe(action, step.view or "", star=step.star)
+            expected = solve(trace.prefix(i + 2), theory, maps=0, speedups=PLAIN)
+            assert answer.status is expected.status
+            assert set(answer.maps) == set(expected.maps)
+            assert answer.count == expected.count
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
+    """Long enough for cores, for visits told to be transitive, and for streets, all of which the longer trace keeps."""
+    trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
+    first, *rest = trace.steps
+    streets = set()
+    with patch.multiple(same, GROWN=100, MANY=1, AT_A_TIME=5), patch.object(solver, "FEW_STEPS", 10):
+        mapper = OnlineMapper(first.view or "", star=first.star, limit=None, maps=0)
+        for i, (action, step) in enumerate(zip(trace.actions, rest, strict=True)):
+            answer = mapper.observe(action, step.view or "", star=step.star)
+            if i % 3 == seed % 3:
+                expected = solve(trace.prefix(i + 2), maps=0, speedups=Speedups.without("sides"))
+                assert (answer.cost, answer.bound.dstates, answer.complete) == (expected.cost, expected.bound.dstates, True)
+                assert set(answer.maps) == set(expected.maps)
+            engine = mapper._search and mapper._search._engine
+            if isinstance(engine, FramedEngine):
+                streets.add((engine._batch, len(engine._said)))
+    assert max(streets)[0] > 5
+    assert seed != 0 or any(told for _, told in streets)
 
 
 @pytest.mark.parametrize("off", ["", "clique", "core_guided", "small_cores", "sides"])
@@ -235,10 +277,14 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
             control = clingo.Control(["--warn=none"])
             control.load(encodings.path("same"))
             control.load(encodings.path("sides"))
-            control.add("base", [], facts.visit_facts(chart, range(len(nodes)), pairs))
-            control.add("base", [], "\n".join(f":- not same({i},{j},{r})." for i, j, r in pairs))
-            control.add("streets", [], facts.side_facts(trace, theory, chart))
-            control.ground([("base", []), ("streets", []), ("street", facts.numbers(*chart.facing[labels.index(dstate)]))])
+            given = [(node, visit, slot) for node, _, visit, slot in nodes]
+            leaves = [(visit, *how) for visit, how in chart.leaves.items()]
+            control.add("visits", [], facts.visit_facts(0, given, leaves, pairs))
+            control.add("visits", [], facts.turn_facts(0, range(len(chart.stars)), chart.turns(trace)))
+            control.add("visits", [], facts.side_facts(theory))
+            control.add("visits", [], "\n".join(f":- not same({i},{j},{r})." for i, j, r in pairs))
+            street = ("street", facts.numbers(*chart.facing[labels.index(dstate)], 0))
+            control.ground([("visits", []), ("more", facts.numbers(0)), ("sides", []), ("streets", facts.numbers(0)), street])
             allowed = next(engine._answers(lambda _: True, "ignore", 1, control=control), False)
             assert not (allowed and dstate in contrary)
             assert allowed or {y for x, y, _ in streets if x == dstate} & set(contrary)
@@ -310,7 +356,7 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
     engine.grow(40)
     with patch.object(FramedEngine, "_charted", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
         engine.grow(121)
-    assert engine.size == 0
+    assert engine.size == 40
     search._start = 121
     maps = tuple(search)
     assert search.status is Status.OPTIMAL
