@@ -36,6 +36,7 @@ from ssh_abduction import encodings, facts
 from ssh_abduction.apart import apart_from, clique
 from ssh_abduction.chart import Chart
 from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Watch
+from ssh_abduction.merging import merged
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
@@ -89,16 +90,18 @@ class NamedEngine(ChartedEngine):
         return np.stack([apart_from(self._chart.seen, self._log.actions[: self.size - 1], t) for t in nodes], axis=1)
 
     def improving_maps(self) -> Iterator[Found]:
-        yield self._found(self._minimal_labels())
+        for labels in self._better_labels():
+            yield self._found(labels)
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         for labels in self._labels_of(cost[0], enough):
             yield self._found(labels)
 
-    def _minimal_labels(self) -> list[int]:
-        """Names for all nodes that need the fewest dstates."""
+    def _better_labels(self) -> Iterator[list[int]]:
+        """Names for all nodes, the last ones such that they need the fewest dstates; before, if that takes its time, some that need few."""
         if not self._chart.links:
-            return [0]
+            yield [0]
+            return
         while not self._one_by_one:
             lazy = len(self._links) < len(self._chart.links)
             answer = None
@@ -113,14 +116,18 @@ class NamedEngine(ChartedEngine):
             if not proven or answer is None:
                 if not lazy:
                     self._ask_one_by_one()
+                elif self._speedups.greedy and len(self._chart.seen) <= AT_ONCE:
+                    actions = [action for _, action, _ in self._chart.links]
+                    yield merged(self._chart.seen, actions, self.clique, self._watch.check)
                 self._add(self._chart.links)
             elif not self._widened(answer):
                 self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
                 labels, failed = self._follow(answer)
                 if not failed:
-                    return labels
+                    yield labels
+                    return
                 self._add(failed)
-        return self._follow(self._first_of_bound())[0]
+        yield self._follow(self._first_of_bound())[0]
 
     def _ask_one_by_one(self) -> None:
         self._one_by_one = True

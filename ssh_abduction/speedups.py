@@ -23,7 +23,7 @@ class Speedups:
     small_cores  with frames: make cores smaller, as long as that is cheap
     sides        with frames: say what order and sides forbid while dstates are sought, street by street
     one_by_one   with names: where that stalls, ask for numbers of dstates one by one
-    greedy       some map without a search, for a time limit that leaves no other
+    greedy       some map without a search, for a time limit that leaves no other; in the causal theory a small one where clingo takes its time
     """
 
     prefixes: bool = True

@@ -9,12 +9,13 @@ from unittest.mock import patch
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from instances import moore
+from instances import maze, moore
 from strategies import traces
 
-from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, engine, named, solve, solver
+from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, engine, facts, named, solve, solver
 from ssh_abduction.apart import apart_from, apartness, clique, far_apart
 from ssh_abduction.checker import check
+from ssh_abduction.merging import merged
 from ssh_abduction.replay import Log
 
 NAMES = [f.name for f in fields(Speedups)]
@@ -157,3 +158,28 @@ def test_a_search_without_greedy_merging_has_a_bound_when_time_is_over() -> None
 def test_unknown_speedups_are_an_error() -> None:
     with pytest.raises(SolverError, match=r"speedups: expected names out of prefixes, .*, got 'magic'"):
         Speedups.without("magic")
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(traces(max_steps=12))
+def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
+    theory = Theory.causal()
+    log = Log(trace, theory)
+    apart = apartness(log.seen, log.actions)
+    labels = merged(log.seen, log.actions, clique(apart, log.seen))
+    found = facts.causal_map(labels, trace)
+    assert check(trace, found, theory) == ()
+    fewest = solve(trace, theory).cost
+    assert fewest
+    assert fewest.dstates <= len(found.dstates) <= len(trace)
+
+
+def test_a_limit_leaves_a_map_of_merged_steps() -> None:
+    """Twice as good as one that is made at once, where clingo takes its time."""
+    walk = maze(5, 5, steps=1600, seed=0)
+    with patch.multiple(named, PATIENCE=1, CORES=1), patch.object(named.NamedEngine, "_ask_one_by_one", side_effect=KeyboardInterrupt):
+        solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes"))
+    assert solution.status is Status.FEASIBLE
+    assert solution.cost
+    assert solution.cost.dstates < 2 * len(set(walk.truth)) < len(set(Log(walk.trace, Theory.causal()).merged()))
+    assert check(walk.trace, solution.maps[0], Theory.causal()) == ()

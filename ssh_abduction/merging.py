@@ -1,0 +1,143 @@
+"""A small map of the causal theory without a search: steps are merged where much speaks for it, in the order of how much.
+
+>>> from ssh_abduction.merging import merged
+>>> merged([0, 1, 0, 1], [0, 0, 0], [0, 1])
+[0, 1, 0, 1]
+
+Steps that are apart are known dstates to begin with. To merge two steps means to merge what the same actions lead to from them, and so on:
+all of it is merged, or nothing, if some two are apart. The more two steps have to say about each other, the less likely that is by chance:
+the *evidence* is how many merges that makes, and how often it confirms one made before. Steps that fit a single known dstate, with much
+evidence, go first; then those with less, or with rivals that have clearly less. A step that fits none is a new dstate.
+
+This is evidence-driven state merging (Lang, Pearlmutter, Price 1998, "Results of the Abbadingo One DFA Learning Competition") for one
+trace, from known dstates all over it rather than from a root.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.apart import Matrix, apartness
+
+# Least evidence for a merge, and how much it has to be ahead of the next; among how many known dstates at most:
+DEMANDS = ((10, 1), (5, 1), (5, 2), (3, 1), (3, 3), (2, 2), (2, 10), (1, 3), (1, 100), (0, 1), (0, 2), (0, 1000))
+
+
+def merged(seen: Sequence[int], actions: Sequence[int], clique: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
+    """The dstate of each step in some map, numbered by first visit.
+
+    seen, actions  what is seen at each step, and done after each but the last
+    clique         steps that are pairwise apart
+    check          called now and then; may raise
+    """
+    classes = _Classes(apartness(seen, actions), actions, clique)
+    for evidence, rivals in DEMANDS:
+        while classes.settle(evidence, rivals, check):
+            pass
+    while len(rest := classes.unsettled()):
+        classes.settle_at_any_rate(int(rest[0]))
+        check()
+    number: dict[int, int] = {}
+    return [number.setdefault(root, len(number)) for root in classes.root.tolist()]
+
+
+class _Classes:
+    """Steps that were merged.
+
+    root   of each step, the step that stands for its class
+    known  of each root, whether its class is a dstate of the map
+    """
+
+    def __init__(self, apart: Matrix, actions: Sequence[int], clique: Sequence[int]) -> None:
+        steps = len(apart)
+        self.root = np.arange(steps)
+        self.known = np.zeros(steps, dtype=bool)
+        self.known[list(clique)] = True
+        self._apart = apart  # of each root, the steps that are apart from some step of its class
+        self._members: list[NDArray[np.int_]] = [np.array([t]) for t in range(steps)]
+        self._leads: list[dict[int, int]] = [{action: t + 1} for t, action in enumerate(actions)] + [{}]  # of each root, by action
+        self._undo: list[tuple[int, int, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]] = []
+
+    def unsettled(self) -> NDArray[np.int_]:
+        return np.flatnonzero(~self.known[self.root])
+
+    def settle(self, evidence: int, rivals: int, check: Callable[[], None]) -> int:
+        """Merge unsettled classes with known dstates, as far as that evidence goes, or make them known. Returns how many."""
+        steps = self.unsettled()
+        fitting = (~self._apart[np.flatnonzero(self.known)][:, steps]).sum(axis=0)
+        settled = 0
+        for t in steps[np.argsort(fitting, kind="stable")].tolist():
+            check()
+            root = int(self.root[t])
+            if self.known[root]:
+                continue
+            fits = self._fitting(root)
+            if len(fits) > rivals:
+                continue
+            ranked = self._ranked(root, fits)
+            if not ranked:
+                self.known[root] = True
+            elif ranked[0][0] < evidence + (ranked[1][0] if len(ranked) > 1 else 0):
+                continue
+            else:
+                self._merge(ranked[0][1], root)
+            settled += 1
+        return settled
+
+    def settle_at_any_rate(self, step: int) -> None:
+        root = int(self.root[step])
+        ranked = self._ranked(root, self._fitting(root))
+        if ranked:
+            self._merge(ranked[0][1], root)
+        else:
+            self.known[root] = True
+
+    def _fitting(self, root: int) -> list[int]:
+        """The known dstates that no step of the class is apart from."""
+        known = np.flatnonzero(self.known)
+        fits: list[int] = known[~self._apart[np.ix_(known, self._members[root])].any(axis=1)].tolist()
+        return fits
+
+    def _ranked(self, root: int, fits: Sequence[int]) -> list[tuple[int, int]]:
+        """The evidence for each of these dstates that the class can be merged with, most first, and the dstate."""
+        found = []
+        for dstate in fits:
+            evidence = self._merge(dstate, root)
+            if evidence is not None:
+                found.append((evidence, dstate))
+                self._take_back()
+        return sorted(found, reverse=True)
+
+    def _merge(self, a: int, b: int) -> int | None:
+        """Merge two classes, and all that has to be merged then. Returns the evidence; None, and nothing is changed, if some are apart."""
+        self._undo = []
+        work = [(a, b)]
+        confirmed = 0
+        while work:
+            a, b = (int(self.root[t]) for t in work.pop())
+            if a == b:
+                confirmed += 1
+                continue
+            if (self.known[a] and self.known[b]) or self._apart[a, self._members[b]].any():
+                self._take_back()
+                return None
+            if self.known[b] or (not self.known[a] and len(self._members[a]) < len(self._members[b])):
+                a, b = b, a
+            leads, more = self._leads[a], self._leads[b]
+            self._undo.append((a, b, self._apart[a].copy(), leads, self._members[a]))
+            work += [(leads[action], t) for action, t in more.items() if action in leads]
+            self._leads[a] = more | leads
+            self._apart[a] |= self._apart[b]
+            self.root[self._members[b]] = a
+            self._members[a] = np.concatenate([self._members[a], self._members[b]])
+        return confirmed + len(self._undo)
+
+    def _take_back(self) -> None:
+        """Undo the last merge."""
+        for a, b, apart, leads, members in reversed(self._undo):
+            self._apart[a], self._leads[a], self._members[a] = apart, leads, members
+            self.root[self._members[b]] = b
+        self._undo = []
