@@ -43,6 +43,8 @@ from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
 HELD_BACK = 100  # maps that are kept until all links are given; then they stream
+AT_A_TIME = 500  # links that clingo is given in one go
+PREPARING = 0.6  # of the time that grounding took, clingo takes before it begins to solve, and can be stopped
 SPARES = 3  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
 CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
@@ -252,9 +254,12 @@ class NamedEngine(ChartedEngine):
         self._restart_seconds = time.perf_counter() - began
 
     def _add(self, links: Iterable[Link]) -> None:
-        """Give clingo more links, and the nodes at their ends."""
-        self._watch.check()
-        self._give(links)
+        """Give clingo more links, and the nodes at their ends: some at a time, as it cannot be stopped meanwhile."""
+        added, before = list(links), self.ground_seconds
+        for start in range(0, len(added), AT_A_TIME):
+            self._watch.check()
+            self._give(added[start : start + AT_A_TIME])
+        self._watch.check(PREPARING * (self.ground_seconds - before))
 
     def _give(self, links: Iterable[Link]) -> None:
         began = time.perf_counter()
