@@ -4,8 +4,8 @@ Frames tell so much that the dstates are all but settled before any place or pat
 are the same or not (`chart.py`). Which ones are is asked of same.lp (`same.py`), which knows the causal axioms and how turns rotate,
 but not the order of places on a path, or its sides. For what that leaves of the dstates, streets.lp finds the fewest paths and places.
 
-*Claim.* Cut to which visits are at one place, a map of the full theory is an answer of same.lp. So the fewest dstates of the latter are a lower bound, and
-if some answer of that cost has streets, all minimal maps are among the answers of that cost with their least streets.
+*Claim.* Cut to which visits are at one place, a map of the full theory is an answer of same.lp. So the fewest dstates of the latter are
+a lower bound, and if some answer of that cost has streets, all minimal maps are among the answers of that cost with their least streets.
 *If none has*, streets.lp is asked which street shows it, and sides.lp says for that street what order and sides demand of the visits
 that are one. If no single street does, or visits are too many for that, streets.lp is asked which labels clash: smallest sets of nodes at
 dstates that no streets fit; same.lp is told that these do not go together. As every map of the full theory keeps that, bounds still hold.

@@ -46,8 +46,8 @@ from ssh_abduction.solver import Cost, Search, Seconds, Solution, Status
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Step, Trace, View
 
-RETRY = 1.02  # after a search that was stopped, the trace grows by this factor before the next, so that few steps are slow,
-PAUSE = 3  # and by so many steps at least
+RETRY = 1.01  # after a search that was stopped, the trace grows by this factor before the next, so that few steps are slow,
+PAUSE = 2  # and by so many steps at least
 
 
 class OnlineMapper:

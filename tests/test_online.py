@@ -134,7 +134,7 @@ def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
         assert answer.status is Status.FEASIBLE or (answer.status is Status.OPTIMAL and best == answer.cost)
         bound = answer.bound.dstates
     assert mapper.solution.status is Status.FEASIBLE
-    assert mapper.searches <= half + 5  # not one a step
+    assert mapper.searches <= half + (len(trace) - half) // 2 + 1  # not one a step
 
 
 def test_what_cannot_be_leaves_no_map() -> None:
