@@ -133,9 +133,14 @@ class Engine:
     bound   lower bound, proven, on the count that is preferred first; None where nothing is known before a search ends
     paths   how many names for paths there are
     clique  nodes that are pairwise apart (chart.py), if it needs to know some; in the causal theory they are steps
+    intact  False after an error that may have left the control half told
+    lists_least  whether maps_of_cost lists maps with the fewest dstates of the prefix alone
     """
 
+    lists_least = False
+
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, paths: int = 0) -> None:
+        self.intact = True
         self.size = 0
         self.paths = paths
         self.bound: int | None = None

@@ -49,6 +49,8 @@ class _Naming:
 class FramedEngine(SameEngine):
     """The full theory with frames, fewest dstates first."""
 
+    lists_least = True
+
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
         super().__init__(trace, theory, watch, log, speedups)
         self.paths = len(trace)  # names for paths are never short

@@ -43,7 +43,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
@@ -266,7 +265,7 @@ class Search:
         self._watch.use_reserve()
         outgrown = isinstance(after._engine, StepEngine) and self._names_pay()
         self._engine = self._new_engine() if outgrown else after._engine.over(trace, self._watch, self._log)
-        if after.stopped == "interrupted":  # perhaps while a step was grounded
+        if after.stopped == "interrupted" or not self._engine.intact:  # perhaps while a step was grounded
             self._engine = self._engine.with_paths(self._engine.paths)
         if not self._whole:
             self.bound, self._lower = after.bound, after._lower
@@ -311,7 +310,7 @@ class Search:
                 if len(self.trace) > FEW_STEPS:
                     self._merge()
             elif not self.prefix:
-                self._engine.grow(min(len(self.trace), FIRST_PREFIX))
+                self._engine.grow(len(self.trace) if self._engine.lists_least else min(len(self.trace), FIRST_PREFIX))
             if self.status is Status.OPTIMAL or self._find_cost():
                 for ssh_map in self._minimal_maps():
                     if self._most and self.count == self._most:
@@ -329,6 +328,9 @@ class Search:
             self.stopped = stop.reason
         except KeyboardInterrupt:
             self.stopped = "interrupted"
+        except Exception:
+            self._engine.intact = False
+            raise
         finally:
             self._watch.stop()
             self._engine.settle()
@@ -535,9 +537,13 @@ class Search:
         self._watch.use_reserve()
         self._watch.start()
         self._lower = None  # a map as cheap as proved is what was not found
-        with suppress(Stopped, KeyboardInterrupt):
+        try:
             self._engine.grow(len(self.trace))
             self.status = Status.OPTIMAL if self._minimise() else Status.UNSATISFIABLE
+        except Stopped as stop:
+            self.stopped = stop.reason
+        except KeyboardInterrupt:
+            self.stopped = "interrupted"
         self._raise_bound(self._engine.bound)
         self._engine.settle()
         self._watch.stop()

@@ -362,3 +362,38 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
     assert search.status is Status.OPTIMAL
     for ssh_map in maps:
         assert check(walk.trace, ssh_map, Theory.topological()) == ()
+
+
+def test_ctrl_c_in_the_last_part_of_the_time_leaves_no_engine_to_go_on_with() -> None:
+    """Perhaps clingo was told half of a core: what it would say then of the longer trace may be wrong."""
+    trace = maze(3, 3, steps=80, seed=1, stars=True).trace
+    search = Search(trace.prefix(70), Theory.topological(), limit=30)
+    with patch.object(Search, "_minimise", side_effect=[Stopped("time limit"), KeyboardInterrupt]):
+        assert [check(search.trace, ssh_map, search.theory) for ssh_map in search] == [()]
+    assert search.stopped == "interrupted"
+    later = Search(trace, Theory.topological(), maps=0, after=search)
+    assert later._engine is not search._engine
+    assert set(later) == set(solve(trace, maps=0).maps)
+
+
+def test_an_error_leaves_no_engine_to_go_on_with() -> None:
+    trace = maze(3, 3, steps=80, seed=1, stars=True).trace
+    first = Search(trace.prefix(60), Theory.topological())
+    list(first)
+    second = Search(trace.prefix(70), Theory.topological(), after=first)
+    assert second._engine is first._engine
+    with patch.object(FramedEngine, "_fewest", side_effect=MemoryError), pytest.raises(MemoryError):
+        list(second)
+    assert Search(trace, Theory.topological(), after=first)._engine is not first._engine
+
+
+def test_maps_of_a_known_cost_are_listed_for_the_whole_trace() -> None:
+    """A shorter prefix has maps with fewer dstates, and those alone would be listed."""
+    trace = maze(3, 3, steps=70, seed=44, stars=True).trace
+    first = Search(trace, Theory.topological(), maps=1)
+    known = next(iter(first))
+    first.stopped = "interrupted"
+    again = Search(trace, Theory.topological(), maps=0, after=first, minimal=known)
+    assert not again.prefix
+    assert set(again) == set(solve(trace, maps=0).maps)
+    assert again.prefix == len(trace)
