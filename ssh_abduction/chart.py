@@ -134,11 +134,10 @@ class FramedChart(Chart):
         """The slot that a visit ends at, and the action there, which leads to the next visit."""
         return {visit: (self.facing[node][1], action) for visit, (node, action, _) in enumerate(self.travels)}
 
-    def turns(self, trace: Trace) -> list[tuple[int, int, int, str]]:
-        """Turns in the order of the trace: the visit, the slots that the robot faced before and after, and which turn it was; each once."""
+    def turns(self, trace: Trace) -> list[tuple[int, str, int]]:
+        """Turns from node to node, each once, in the order of the trace."""
         steps = zip(pairwise(self.node_of), trace.actions, strict=False)
-        turns = ((*self.facing[s], self.facing[x][1], action.turn) for (s, x), action in steps if action.turn)
-        return list(dict.fromkeys(turns))
+        return list(dict.fromkeys((s, action.turn, x) for (s, x), action in steps if action.turn))
 
     def fits(self) -> list[tuple[int, int, int]]:
         """Visits I < J that may be at one place, and R, where slot 0 of I is then slot R of J."""

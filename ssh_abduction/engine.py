@@ -322,7 +322,7 @@ class StepEngine(Engine):
 
 
 class ChartedEngine(Engine):
-    """An engine that charts a prefix (chart.py) and takes a new control for it."""
+    """An engine that charts a prefix (chart.py)."""
 
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
         super().__init__(trace, theory, watch)
@@ -331,9 +331,6 @@ class ChartedEngine(Engine):
 
     def with_paths(self, paths: int) -> Self:
         return type(self)(self._trace, self._theory, self._watch, self._log, self._speedups)
-
-    def over(self, trace: Trace, watch: Watch, log: Log) -> Self:
-        return type(self)(trace, self._theory, watch, log, self._speedups)
 
     def next_size(self, failed: int) -> int:
         steps = len(self._trace)
@@ -344,16 +341,3 @@ class ChartedEngine(Engine):
     @property
     def size_to_go_on(self) -> int:
         return self.next_size(self.size)
-
-    def grow(self, size: int) -> None:
-        if size == self.size:
-            return
-        try:
-            self._take(size)
-        except BaseException:
-            self.size = 0  # nothing of this prefix is to be taken for granted
-            raise
-
-    def _take(self, size: int) -> None:
-        """Take a control for the first steps."""
-        raise NotImplementedError

@@ -276,25 +276,24 @@ def street_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
     """What happened at the nodes of a chart, as facts for streets.lp."""
     facts = [f"turned({s},{x},{-action})." for s, action, x in chart.links if action < 0]
     facts += [f"travel({s},{x})." for s, _, x in chart.travels]
-    turns = zip(pairwise(chart.node_of), trace.actions, strict=False)
-    for s, x, turn in dict.fromkeys((s, x, action.turn) for (s, x), action in turns if action.turn):
-        facts.append(f"around({s},{x})." if turn == "around" else f"bend({s},{turn},{x}).")
-    return "\n".join([*facts, *_side_axioms(theory)])
-
-
-def _side_axioms(theory: Theory) -> list[str]:
-    return [*(["sided."] if theory.boundary != "none" else []), *(["symmetric."] if theory.symmetric_sides else [])]
+    facts += [f"around({s},{x})." if turn == "around" else f"bend({s},{turn},{x})." for s, turn, x in chart.turns(trace)]
+    return "\n".join([*facts, side_facts(theory)])
 
 
 def side_facts(theory: Theory) -> str:
-    """What of the sides of paths holds in a theory, as facts for sides.lp."""
-    return "\n".join(_side_axioms(theory))
+    """Which axioms of the sides of paths hold in a theory, as facts."""
+    facts = ["sided."] if theory.boundary != "none" else []
+    facts += ["symmetric."] if theory.symmetric_sides else []
+    return "\n".join(facts)
 
 
-def turn_facts(batch: int, visits: Iterable[int], turns: Iterable[tuple[int, int, int, str]]) -> str:
-    """New visits, and how the robot turned on a visit, from slot to slot, as facts for sides.lp."""
-    new = [f"{'about' if turn == 'around' else 'turns'}({batch},{visit},{slot},{faced})." for visit, slot, faced, turn in turns]
-    return "\n".join([*(f"visit({batch},{visit})." for visit in visits), *new])
+def turn_facts(batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]) -> str:
+    """New visits, and new turns on a visit, from slot to slot, as facts for sides.lp."""
+    facts = [f"visit({batch},{visit})." for visit in visits]
+    for s, turn, x in turns:
+        (visit, slot), (_, faced) = chart.facing[s], chart.facing[x]
+        facts.append(f"{'about' if turn == 'around' else 'turns'}({batch},{visit},{slot},{faced}).")
+    return "\n".join(facts)
 
 
 def read_contrary(model: Model) -> tuple[list[int], list[int]]:

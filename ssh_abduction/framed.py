@@ -14,7 +14,7 @@ dstates that no streets fit; same.lp is told that these do not go together. As e
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -25,7 +25,7 @@ from ssh_abduction import encodings, facts
 from ssh_abduction.chart import Chart, FramedChart, NoFrame
 from ssh_abduction.engine import Found, Watch
 from ssh_abduction.replay import Log
-from ssh_abduction.same import Pair, SameEngine
+from ssh_abduction.same import Pair, SameEngine, smaller
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
@@ -55,7 +55,6 @@ class FramedEngine(SameEngine):
         super().__init__(trace, theory, watch, log, speedups)
         self.paths = len(trace)  # names for paths are never short
         self._framed = True  # whether the visits fit their frames
-        self.clashes = 0  # sets of nodes whose dstates were found to have no streets
         self._best: tuple[tuple[int, ...], list[_Naming]] | None = None  # the minimal cost, and all namings that have it
 
     def grow(self, size: int) -> None:
@@ -73,7 +72,7 @@ class FramedEngine(SameEngine):
         best: Found | None = None
         labels = self._minimal_labels()
         while labels is not None:
-            named = _Naming(labels, self._street_control(labels, range(len(labels))))
+            named = _Naming(labels, self._street_control(labels))
             for best in self._better_streets(named):
                 yield best
             if best is not None:
@@ -112,7 +111,7 @@ class FramedEngine(SameEngine):
                 for labels in all_labels:
                     if tuple(labels) in known:
                         continue
-                    naming = _Naming(labels, self._street_control(labels, range(len(labels))))
+                    naming = _Naming(labels, self._street_control(labels))
                     if next(self._streets(naming, "ignore"), None) is None:
                         refused = labels
                         break
@@ -132,13 +131,13 @@ class FramedEngine(SameEngine):
             return
         proven = yield from self._streets(naming, "opt", BETTERING)
         if not proven:
-            control = self._street_control(naming.labels, range(len(naming.labels)), ["--opt-strategy=usc"])
+            control = self._street_control(naming.labels, ["--opt-strategy=usc"])
             yield from self._streets(replace(naming, control=control), "opt")
 
     def _streets(self, naming: _Naming, mode: str, conflicts: int = -1) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
         labels = naming.labels
-        control = naming.control or self._street_control(labels, range(len(labels)))
+        control = naming.control or self._street_control(labels)
         dstates = len(set(labels))
 
         def read(model: clingo.Model) -> Found:
@@ -146,12 +145,12 @@ class FramedEngine(SameEngine):
 
         return (yield from self._answers(read, mode, int(mode == "ignore"), control=control, conflicts=conflicts))
 
-    def _street_control(self, labels: Sequence[int], nodes: Sequence[int], options: Sequence[str] = ()) -> clingo.Control:
-        """A control for the streets that fit the labels of these nodes."""
+    def _street_control(self, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None) -> clingo.Control:
+        """A control for the streets that fit the labels of all nodes, or of these."""
         began = time.perf_counter()
         control = self._streets_of(self._chart, options)
         control.load(encodings.path("preference"))
-        control.add("base", [], facts.settled_facts(self._theory, self._chart, labels, nodes))
+        control.add("base", [], facts.settled_facts(self._theory, self._chart, labels, range(len(labels)) if nodes is None else nodes))
         control.ground([("base", []), ("least", [])])
         self._watch.check()
         self.ground_seconds += time.perf_counter() - began
@@ -164,7 +163,6 @@ class FramedEngine(SameEngine):
             return
         rules = []
         for clash in self._clashing(labels):
-            self.clashes += 1
             first = {labels[node]: node for node in clash}
             different = [pair for a, b in combinations(first.values(), 2) if (pair := self._pair(a, b)) in self._fits]
             rules.append(facts.forbidden_pairs(self._spanning(labels, clash), different))
@@ -175,7 +173,7 @@ class FramedEngine(SameEngine):
         control = self._streets_of(self._chart)
         control.add("base", [], facts.settled_labels(enumerate(labels)))
         control.ground([("base", []), ("contrary", [])])
-        contrary, twice = next(iter(self._answers(facts.read_contrary, "ignore", 1, control=control)))
+        contrary, twice = next(self._answers(facts.read_contrary, "ignore", 1, control=control))
         stand = {label: self._chart.facing[node] for node, label in enumerate(labels)}
         if any(self._say_once("street", *stand[dstate]) for dstate in contrary):
             return True
@@ -223,22 +221,12 @@ class FramedEngine(SameEngine):
 
     def _clash(self, labels: Sequence[int]) -> list[int]:
         """One such set, where it takes the choices of streets.lp to see that there are no streets: nodes are left out while there are none."""
-        nodes = list(range(len(labels)))
-        size = len(nodes)
-        while size := size // 2:
-            start = 0
-            while start < len(nodes) and len(nodes) > 1:
-                fewer = nodes[:start] + nodes[start + size :]
-                if self._has_streets(labels, fewer):
-                    start += size
-                else:
-                    nodes = fewer
-        return nodes
 
-    def _has_streets(self, labels: Sequence[int], nodes: Sequence[int]) -> bool:
-        """Whether some streets fit the labels of these nodes."""
-        control = self._street_control(labels, nodes)
-        return next(iter(self._answers(lambda _: True, "ignore", 1, control=control)), False)
+        def clashing(nodes: list[int]) -> list[int] | None:
+            control = self._street_control(labels, nodes=nodes)
+            return next(self._answers(lambda _: None, "ignore", 1, control=control), nodes)
+
+        return smaller(list(range(len(labels))), clashing)
 
     def _charted(self, size: int) -> FramedChart:
         """The nodes, and which of them are at different places because of what the trace alone says of order and sides."""

@@ -64,6 +64,18 @@ class NamedEngine(ChartedEngine):
         self._one_by_one = False
         self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
 
+    def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
+        return NamedEngine(trace, self._theory, watch, log, self._speedups)
+
+    def grow(self, size: int) -> None:
+        if size == self.size:
+            return
+        try:
+            self._take(size)
+        except BaseException:
+            self.size = 0  # nothing of this prefix is to be taken for granted
+            raise
+
     def _take(self, size: int) -> None:
         """Chart the first steps, pin a clique of their nodes, and take a control for them."""
         began = time.perf_counter()

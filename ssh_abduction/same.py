@@ -20,7 +20,7 @@ fails to be transitive is a call. Cores are made small as long as that is cheap:
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import replace
 from typing import Self, TypeAlias
 
@@ -92,9 +92,7 @@ class SameEngine(ChartedEngine):
         self._control = clingo.Control(["--warn=none", "--heuristic=Domain"])
         self._control.load(encodings.path("same"))
         self._batch = -1
-        self._nodes = self._visits = 0  # so many clingo knows
-        self._ends: set[int] = set()  # visits of which it knows the end
-        self._turns: set[tuple[int, int, int, str]] = set()
+        self._chart = FramedChart((), (), (), (), (), ())  # what clingo knows
         self._fits: frozenset[Pair] = frozenset()
         self._least = 0
         self._avoided: dict[int, clingo.Symbol] = {}  # what is assumed not to be there, by the literal of that
@@ -108,20 +106,19 @@ class SameEngine(ChartedEngine):
         """Tell clingo what it does not know yet of a chart. New nodes come after the others in the order of choice."""
         if self._batch >= 0:
             self._control.release_external(facts.listed(self._batch))
-        self._chart = chart
+        known, self._chart = self._chart, chart
         self._batch += 1
-        nodes = [(place, *chart.facing[node]) for place, node in enumerate(order, self._nodes)]
-        leaves = [(visit, *how) for visit, how in chart.leaves.items() if visit not in self._ends]
-        turns = [turn for turn in chart.turns(self._trace) if turn not in self._turns]
-        new = sorted(fits - self._fits)
-        told = facts.visit_facts(self._batch, nodes, leaves, new, sorted(self._fits - fits))
-        self._control.add(f"visits_{self._batch}", [], told)
-        self._control.add(f"visits_{self._batch}", [], facts.turn_facts(self._batch, range(self._visits, len(chart.stars)), turns))
-        self._control.ground([(f"visits_{self._batch}", []), ("more", facts.numbers(self._batch))])
+        nodes = [(place, *chart.facing[node]) for place, node in enumerate(order, len(known.seen))]
+        leaves = [(visit, *how) for visit, how in chart.leaves.items() if visit not in known.leaves]
+        visits = range(len(known.stars), len(chart.stars))
+        turns = chart.turns(self._trace)[len(known.turns(self._trace)) :]
+        new, unfit = sorted(fits - self._fits), sorted(self._fits - fits)
+        self._fits = fits
+        part = f"visits_{self._batch}"
+        self._control.add(part, [], facts.visit_facts(self._batch, nodes, leaves, new, unfit))
+        self._control.add(part, [], facts.turn_facts(self._batch, chart, visits, turns))
+        self._control.ground([(part, []), ("more", facts.numbers(self._batch))])
         self._control.assign_external(facts.listed(self._batch), True)
-        self._nodes, self._visits, self._fits = len(chart.seen), len(chart.stars), fits
-        self._ends.update(visit for visit, *_ in leaves)
-        self._turns.update(turns)
         atoms = self._control.symbolic_atoms
         for place, *_ in nodes:
             atom = atoms[facts.alone(place)]
@@ -173,20 +170,8 @@ class SameEngine(ChartedEngine):
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
 
     def _smaller(self, core: list[int]) -> list[int]:
-        """A core of fewer members, as long as that is cheap: parts of it are left out, half of it first, single members last."""
-        size, failed = len(core), 0
-        while size := size // 2:
-            start = 0
-            while start < len(core) and len(core) > 1:
-                _, fewer = self._verdict(lambda _: None, core[:start] + core[start + size :], TRIES)
-                if fewer is not None:
-                    core = fewer
-                    continue
-                start += size
-                failed += 1
-                if failed == FAILED_TRIES:
-                    return core
-        return core
+        """A core of fewer members, as long as that is cheap."""
+        return smaller(core, lambda part: self._verdict(lambda _: None, part, TRIES)[1], FAILED_TRIES)
 
     def _relax(self, core: Sequence[int]) -> None:
         """As not all members of a core can be avoided, ask only that no two of them are there."""
@@ -333,6 +318,27 @@ class SameEngine(ChartedEngine):
             i, r = first.get(visit, (visit, 0))
             labels.append(number.setdefault((i, (slot - r) % 4), len(number)))
         return tuple(labels)
+
+
+def smaller(members: list[int], shrunk: Callable[[list[int]], list[int] | None], tries: int | None = None) -> list[int]:
+    """Fewer members that still have what all of them have: parts are left out, half of them first, single members last.
+
+    shrunk  of some members those that have it, if they do
+    tries   after so many in vain, what is left is returned
+    """
+    size, failed = len(members), 0
+    while size := size // 2:
+        start = 0
+        while start < len(members) and len(members) > 1:
+            fewer = shrunk(members[:start] + members[start + size :])
+            if fewer is not None:
+                members = fewer
+                continue
+            start += size
+            failed += 1
+            if failed == tries:
+                return members
+    return members
 
 
 class _Transitive(clingo.Propagator):

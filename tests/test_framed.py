@@ -280,7 +280,7 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
             given = [(node, visit, slot) for node, _, visit, slot in nodes]
             leaves = [(visit, *how) for visit, how in chart.leaves.items()]
             control.add("visits", [], facts.visit_facts(0, given, leaves, pairs))
-            control.add("visits", [], facts.turn_facts(0, range(len(chart.stars)), chart.turns(trace)))
+            control.add("visits", [], facts.turn_facts(0, chart, range(len(chart.stars)), chart.turns(trace)))
             control.add("visits", [], facts.side_facts(theory))
             control.add("visits", [], "\n".join(f":- not same({i},{j},{r})." for i, j, r in pairs))
             street = ("street", facts.numbers(*chart.facing[labels.index(dstate)], 0))
