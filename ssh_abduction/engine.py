@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
 import sys
 import threading
@@ -105,6 +106,11 @@ def peak_memory() -> float:
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
@@ -341,3 +347,11 @@ class ChartedEngine(Engine):
     @property
     def size_to_go_on(self) -> int:
         return self.next_size(self.size)
+
+    def _new_control(self, encoding: str, base: str, options: Sequence[str]) -> clingo.Control:
+        """A control with an encoding, and these facts in its base."""
+        control = clingo.Control(["--warn=none", *options])
+        control.load(encodings.path(encoding))
+        control.add("base", [], base if self._speedups.watched else f"{base}\n{facts.watched()}.")
+        control.ground([("base", [])])
+        return control

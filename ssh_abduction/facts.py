@@ -191,6 +191,11 @@ def batch_facts(
     return "\n".join(facts)
 
 
+def watched() -> Symbol:
+    """The external atom that makes constraints of three literals longer, so that clasp watches them."""
+    return Function("watched")
+
+
 def resting(batch: int) -> Symbol:
     """The atom that holds if a step of the batches up to this one is at the rest of its view. Assumed by who asks for such a map."""
     return Function("resting", [Number(batch)])

@@ -14,7 +14,7 @@ Not every step is needed. The control starts with the links of the pinned steps;
 at which it fails are added, until one holds everywhere. That is a relaxation until then, so its bounds hold. Where clingo does not
 answer soon, what is missing is rather more knowledge than less, and all links are given at once. Then it is also told which pairs
 of steps are apart, where more than one action shows it: no two of them are at one name. The links say so, too, but only once it is
-chosen where they lead.
+chosen where they lead. From then on clasp searches with two threads, which tell each other what they learn.
 
 Raising the bound by cores stalls when what is missing can be spread over many views: every core is then about all of them. After
 CORES conflicts the numbers of dstates are asked for one by one instead, from the bound up: is there an answer that costs no more? If
@@ -26,16 +26,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator, Iterable, Iterator, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-import clingo
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction import encodings, facts
+from ssh_abduction import facts
 from ssh_abduction.apart import apart_from, clique
 from ssh_abduction.chart import Chart
-from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Watch
+from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Watch, processors
 from ssh_abduction.merging import merged
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
@@ -45,10 +44,9 @@ from ssh_abduction.trace import Trace
 HELD_BACK = 100  # maps that are kept until all links are given; then they stream
 AT_A_TIME = 500  # links that clingo is given in one go
 PREPARING = 0.6  # of the time that grounding took, clingo takes before it begins to solve, and can be stopped
-SPARES = 3  # spare names of a view, to begin with
+SPARES = 2  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
 CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
-FEW_SPARES = 2  # spare names of a view for that, where SPARES were enough: fewer choices, and clingo answers sooner
 
 
 Link: TypeAlias = tuple[int, int, int]  # node, action, node
@@ -61,7 +59,7 @@ class NamedEngine(ChartedEngine):
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
         super().__init__(trace, theory, watch, log, speedups)
         self._restart_seconds = 0.0  # what the last new control took
-        self._one_by_one = False
+        self._hard = self._one_by_one = False  # whether few conflicts were not enough, and whether raising the bound by cores stalled
         self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
 
     def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
@@ -89,7 +87,7 @@ class NamedEngine(ChartedEngine):
         columns = apart[:, self.clique] if len(seen) <= AT_ONCE else self._columns(self.clique)
         self._may_be = [[pinned[t]] if t in pinned else (~row).nonzero()[0].tolist() for t, row in enumerate(columns)]
         self._far = self._chart.far_apart(apart) if self._speedups.apart and len(seen) <= AT_ONCE else None
-        self._one_by_one = False
+        self._one_by_one = self._hard = False
         self._spares = dict.fromkeys(seen, SPARES)
         self._links = dict.fromkeys(self._chart.links)
         if self._speedups.lazy:
@@ -134,6 +132,8 @@ class NamedEngine(ChartedEngine):
                     actions = [action for _, action, _ in self._chart.links]
                     yield merged(self._chart.seen, actions, self.clique, self._watch.check)
                 self._add(self._chart.links)
+                self._hard = True
+                self._configure()
             elif not self._widened(answer):
                 self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
                 labels, failed = self._follow(answer)
@@ -145,8 +145,15 @@ class NamedEngine(ChartedEngine):
 
     def _ask_one_by_one(self) -> None:
         self._one_by_one = True
-        self._spares = {view: FEW_SPARES if count == SPARES else count for view, count in self._spares.items()}
-        self._restart()
+        self._configure()
+
+    def _configure(self) -> None:
+        """Let clasp search as suits what is asked, and how hard it turned out to be."""
+        configuration: Any = self._control.configuration
+        if self._one_by_one:
+            configuration.configuration, configuration.sat_prepro = "crafty", "no"
+        if self._hard and self._speedups.threads and processors() > 1:
+            configuration.solve.parallel_mode = "2,compete"
 
     def _first_of_bound(self) -> dict[int, int]:
         """Raise the bound until there is a map that costs no more. All links are given."""
@@ -252,10 +259,8 @@ class NamedEngine(ChartedEngine):
             (s, action, x) for t, action, u in self._chart.links for s in self._choices[t] if s not in self._rest for x in self._choices[u]
         }
         cores = ["--opt-strategy=usc"] if self._speedups.core_guided else []
-        self._control = clingo.Control(["--warn=none", *(["--configuration=handy"] if self._one_by_one else cores)])
-        self._control.load(encodings.path("names"))
-        self._control.add("base", [], facts.name_facts(names, spares.values(), leads))
-        self._control.ground([("base", [])])
+        self._control = self._new_control("names", facts.name_facts(names, spares.values(), leads), ["--eq=1", *cores])
+        self._configure()
         self._given: set[int] = set()  # nodes
         self._open = np.zeros(len(seen), dtype=bool)  # whether a node is one of them, and not pinned
         self._last: dict[int, int] = {}  # by view, the step given last

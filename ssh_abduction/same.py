@@ -26,7 +26,7 @@ from typing import Self, TypeAlias
 
 import clingo
 
-from ssh_abduction import encodings, facts
+from ssh_abduction import facts
 from ssh_abduction.apart import clique
 from ssh_abduction.chart import Chart, FramedChart
 from ssh_abduction.engine import ChartedEngine, Watch
@@ -89,8 +89,7 @@ class SameEngine(ChartedEngine):
     def _begin(self, chart: FramedChart) -> None:
         """Take a control that knows nothing."""
         self._first_nodes = len(chart.seen)
-        self._control = clingo.Control(["--warn=none", "--heuristic=Domain"])
-        self._control.load(encodings.path("same"))
+        self._control = self._new_control("same", "", ["--heuristic=Domain"])
         self._batch = -1
         self._chart = FramedChart((), (), (), (), (), ())  # what clingo knows
         self._fits: frozenset[Pair] = frozenset()

@@ -15,7 +15,7 @@ import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -102,6 +102,8 @@ def run(options: argparse.Namespace) -> int:
     if options.jobs == 0:
         raise SSHError("--jobs: expected how many traces to solve at a time, or -1 for one a core, got 0; leave it out for 1")
     speedups = Speedups.without(options.without_speedups)
+    if options.scheduler or options.jobs not in (None, 1):
+        speedups = replace(speedups, threads=False)  # the processors have other traces to solve
     question = Question(theory_of(options), options.time_limit, options.maps, options.memory_limit, speedups, options.json)
     if options.scheduler is None:
         answers = _here(question, paths, options.jobs or 1)
