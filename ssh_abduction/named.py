@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from ssh_abduction import facts
 from ssh_abduction.apart import apart_from, clique
 from ssh_abduction.chart import Chart
-from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Watch, processors
+from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Watch
 from ssh_abduction.merging import merged
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
@@ -126,13 +126,14 @@ class NamedEngine(ChartedEngine):
                     proven = end.value
                     break
             if not proven or answer is None:
+                self._hard = True
                 if not lazy:
                     self._ask_one_by_one()
-                elif self._speedups.greedy and len(self._chart.seen) <= AT_ONCE:
+                    continue
+                if self._speedups.greedy and len(self._chart.seen) <= AT_ONCE:
                     actions = [action for _, action, _ in self._chart.links]
                     yield merged(self._chart.seen, actions, self.clique, self._watch.check)
                 self._add(self._chart.links)
-                self._hard = True
                 self._configure()
             elif not self._widened(answer):
                 self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
@@ -152,8 +153,11 @@ class NamedEngine(ChartedEngine):
         configuration: Any = self._control.configuration
         if self._one_by_one:
             configuration.configuration, configuration.sat_prepro = "crafty", "no"
-        if self._hard and self._speedups.threads and processors() > 1:
-            configuration.solve.parallel_mode = "2,compete"
+        if self._hard and self._speedups.threads:
+            from joblib import cpu_count  # takes its time to load
+
+            if cpu_count() > 1:
+                configuration.solve.parallel_mode = "2,compete"
 
     def _first_of_bound(self) -> dict[int, int]:
         """Raise the bound until there is a map that costs no more. All links are given."""
