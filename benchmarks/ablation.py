@@ -28,7 +28,7 @@ FRAMED = ["full taylor-hall", SMALL.name, "full maze 5x5 n=1600", "full maze 10x
 USED = {
     "causal": {"prefixes", "names", "clique", "apart", "lazy", "core_guided", "watched", "one_by_one", "threads", "greedy"},
     "full": {"prefixes", "path_names", "from_below"},
-    "framed": {"prefixes", "names", "clique", "core_guided", "small_cores", "sides", "watched"},
+    "framed": {"prefixes", "names", "clique", "core_guided", "small_cores", "sides", "annealed", "watched"},
 }
 
 

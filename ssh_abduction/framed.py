@@ -22,10 +22,11 @@ from itertools import combinations
 import clingo
 
 from ssh_abduction import encodings, facts
+from ssh_abduction.annealing import annealed
 from ssh_abduction.chart import Chart, FramedChart, NoFrame
 from ssh_abduction.engine import Found, Watch
 from ssh_abduction.replay import Log
-from ssh_abduction.same import Pair, SameEngine, smaller
+from ssh_abduction.same import Pair, SameEngine, TakesLong, smaller
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
@@ -35,6 +36,9 @@ MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much 
 # clasp's way to list answers in which no atom that is shown can be spared:
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 KEPT = 10  # controls of minimal namings that are kept until their maps are listed: each is some megabytes
+GUESSABLE = 1_000_000  # visits that may be one, above which annealing takes too much memory
+GUESSES = 20  # labels that are tried, near what annealing guesses
+GUESSING = 1000  # conflicts after which better streets of these are no longer sought
 BETTERING = 20_000  # conflicts after which better streets are no longer sought one after another
 
 
@@ -54,6 +58,7 @@ class FramedEngine(SameEngine):
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
         super().__init__(trace, theory, watch, log, speedups)
         self.paths = len(trace)  # names for paths are never short
+        self._guessed = False  # whether a map was
         self._framed = True  # whether the visits fit their frames
         self._best: tuple[tuple[int, ...], list[_Naming]] | None = None  # the minimal cost, and all namings that have it
 
@@ -70,7 +75,7 @@ class FramedEngine(SameEngine):
         if not self._framed:
             return
         best: Found | None = None
-        labels = self._minimal_labels()
+        labels = yield from self._fewest_dstates()
         while labels is not None:
             named = _Naming(labels, self._street_control(labels))
             for best in self._better_streets(named):
@@ -78,7 +83,7 @@ class FramedEngine(SameEngine):
             if best is not None:
                 break
             self._forbid(labels)
-            labels = self._minimal_labels()
+            labels = yield from self._fewest_dstates()
         if best is None or labels is None:
             return
         namings = [named]
@@ -90,6 +95,31 @@ class FramedEngine(SameEngine):
             if found.cost == best.cost:
                 namings.append(other if len(namings) < KEPT else replace(other, control=None))
         self._best = best.cost, namings
+
+    def _fewest_dstates(self) -> Generator[Found, None, list[int] | None]:
+        """The labels of `_minimal_labels`. Where they take long, maps that are soon found come before."""
+        try:
+            guess = self._speedups.annealed and not self._guessed and len(self._fits) <= GUESSABLE
+            return self._minimal_labels(patient=not guess)
+        except TakesLong:
+            self._guessed = True
+            yield from self._guesses()
+            return self._minimal_labels()
+
+    def _guesses(self) -> Iterator[Found]:
+        """Maps with few dstates, if annealing leads to any, each better than the one before."""
+        mode = "opt" if len(self._theory.priorities) > 1 else "ignore"
+        for labels, _ in zip(self._labels_near(annealed(self._chart, self._watch.check)), range(GUESSES), strict=False):
+            if self._known and len(set(labels)) >= len(set(self._known)):
+                break
+            found = next(self._streets(_Naming(list(labels), None), mode), None)
+            if found is None:
+                self._forbid(labels)
+            else:
+                self._known = labels
+                yield found
+        if self._known:
+            yield from self._streets(_Naming(list(self._known), None), mode, GUESSING)
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         if not self._framed:
@@ -203,6 +233,7 @@ class FramedEngine(SameEngine):
 
     def _begin(self, chart: FramedChart) -> None:
         super()._begin(chart)
+        self._guessed = False
         self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # parts of sides.lp
 
     def _give(self, chart: FramedChart, order: Sequence[int], fits: frozenset[Pair]) -> None:

@@ -15,18 +15,23 @@ avoided, raises the bound by one; from then on it is asked that at most one of t
 Kaufmann, Matheis, Schaub 2012, "Unsatisfiability-based optimization in clasp"). Each optimum of the whole holds what is asked for
 in the end, so these answers are all minimal ones. clasp has that built in, but begins anew with each call, and an answer that
 fails to be transitive is a call. Cores are made small as long as that is cheap: small ones are about one part of the world.
+
+*Near a guess.* Where that takes long, some map is known soon: clingo is asked for answers in which visits are one that `annealing.py` takes
+for one. They need not have the fewest dstates. But where they have as few as the bound, they do.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import Self, TypeAlias
 
 import clingo
 
 from ssh_abduction import facts
+from ssh_abduction.annealing import Guess
 from ssh_abduction.apart import clique
 from ssh_abduction.chart import Chart, FramedChart
 from ssh_abduction.engine import ChartedEngine, Watch
@@ -35,15 +40,21 @@ from ssh_abduction.trace import Trace
 
 SECONDS_A_PAIR = 3e-5  # what clingo takes, about, to ground two visits that may be one: it cannot be stopped meanwhile
 AT_A_TIME = 20_000  # threes of visits that clingo is told of in one go
+MANY_CONFLICTS = 20_000  # or the conflicts of one call
 TRIES = 100  # conflicts after which it is left open whether a core can be smaller
 FAILED_TRIES = 20  # tries after which a core is kept as it is
 GROWN = 1.1  # how many times as many nodes as at first a control may have, before a new one is taken with a better order
+PATIENCE = 5.0  # seconds that clingo takes for the fewest dstates, after which some map is guessed first
 MANY = 5  # answers found one by one, after which they are looked for nearby
 FAR = 200  # failures to be transitive after which an answer is not nearby
 
 Pair: TypeAlias = tuple[int, int, int]  # visits I < J, R: slot 0 of I is slot R of J
 Three: TypeAlias = tuple[int, int, int, int, int]  # visits I < J < K, and how I is turned to J, and J to K
 _Turned: TypeAlias = dict[int, dict[int, int]]  # of visits that are the same: which slot of the other slot 0 is
+
+
+class TakesLong(Exception):  # noqa: N818 - not an error
+    """Clingo was asked often, and has not found the fewest dstates yet."""
 
 
 class SameEngine(ChartedEngine):
@@ -132,14 +143,18 @@ class SameEngine(ChartedEngine):
                 self._transitive.literals[pair] = atom.literal
         self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
         self._excluded = 0  # so many of them clingo will not find again
+        self._known: tuple[int, ...] | None = None  # labels of a map
 
     def _raise_bound(self) -> None:
         self.bound = max(self.bound or 0, self._least)
 
-    def _minimal_labels(self) -> list[int] | None:
-        """Dstates of all nodes, as few as can be; None where clingo was told more than any can satisfy."""
+    def _minimal_labels(self, patient: bool = True) -> list[int] | None:
+        """Dstates of all nodes, as few as can be; None where clingo was told more than any can satisfy. Raises TakesLong if not patient."""
         while not self._found:
-            pairs = self._fewest()
+            if self._known and self._least == len(set(self._known)):
+                self._found.append(self._known)
+                break
+            pairs = self._fewest(patient)
             if pairs is None:
                 return None
             if threes := self._intransitive(pairs):
@@ -148,7 +163,7 @@ class SameEngine(ChartedEngine):
                 self._found.append(self._labels(pairs))
         return list(self._found[0])
 
-    def _fewest(self) -> list[Pair] | None:
+    def _fewest(self, patient: bool) -> list[Pair] | None:
         """An answer with the fewest lone nodes."""
         if not self._speedups.core_guided:
             better = list(self._answers(lambda model: (self._pairs(model), model.cost[0]), "opt", 0))
@@ -158,7 +173,11 @@ class SameEngine(ChartedEngine):
             self._raise_bound()
             return pairs
         while True:
-            answer, core = self._verdict(self._pairs, list(self._avoided))
+            if not patient and self.ground_seconds + self.solve_seconds > PATIENCE:
+                raise TakesLong
+            answer, core = self._verdict(self._pairs, list(self._avoided), -1 if patient else MANY_CONFLICTS)
+            if core is None and answer is None and not patient:
+                raise TakesLong
             if core is None:
                 return answer
             if not core:
@@ -207,6 +226,53 @@ class SameEngine(ChartedEngine):
     def _close(self, threes: Iterable[Three]) -> None:
         """Tell clingo that to be the same is transitive, of these visits."""
         self._tell(facts.three_facts(self._parts, threes), "closed", self._parts)
+
+    def _labels_near(self, guess: Guess) -> Iterator[tuple[int, ...]]:
+        """Labels of all nodes where visits that the guess is sure of, and has at one place, are one; then others, with few dstates.
+
+        First, no others are one where that can be. Then clingo is asked for no lone nodes; of those that a core shows to be too many, one
+        is left alone. Visits of places that cannot all be as guessed are let free.
+        """
+        members: dict[int, list[int]] = {}
+        for visit in guess.sure.nonzero()[0].tolist():
+            members.setdefault(int(guess.states[visit]) // 4, []).append(visit)
+        place_of: dict[int, int] = {}  # by the literal that two of its visits are one
+        for place, visits in members.items():
+            pairs = [(i, j, int(guess.states[i] - guess.states[j]) % 4) for i, j in combinations(visits, 2)]
+            place_of |= {self._transitive.literals[pair]: place for pair in pairs if pair in self._transitive.literals}
+        avoided = {
+            -literal
+            for (i, j, r), literal in self._transitive.literals.items()
+            if guess.sure[i]
+            and guess.sure[j]
+            and (guess.states[i] // 4 != guess.states[j] // 4 or (guess.states[i] - guess.states[j]) % 4 != r)
+        }
+        patient = False
+        while True:
+            answer, core = self._verdict(self._pairs, [*place_of, *avoided])
+            if core is not None:
+                if fewer := [literal for literal in core if literal in avoided]:
+                    avoided.difference_update(fewer[-1:] if patient else fewer)
+                elif core:
+                    free = self._together_impossible(sorted({place_of[literal] for literal in core}), place_of)
+                    place_of = {literal: place for literal, place in place_of.items() if place not in free}
+                else:
+                    return
+            elif threes := self._intransitive(answer or ()):
+                self._close(threes)
+            else:
+                yield self._labels(answer or ())
+                if not patient:
+                    patient, avoided = True, set(self._avoided)
+
+    def _together_impossible(self, places: list[int], place_of: Mapping[int, int]) -> list[int]:
+        """Of places that cannot all be as guessed, few that cannot."""
+
+        def impossible(some: list[int]) -> list[int] | None:
+            core = self._verdict(lambda _: None, [literal for literal, place in place_of.items() if place in some], TRIES)[1]
+            return None if core is None else sorted({place_of[literal] for literal in core})
+
+        return smaller(places, impossible, FAILED_TRIES)
 
     def _labels_of(self, dstates: int) -> Generator[list[int], None, None]:
         """All ways to be at so many dstates, each once.

@@ -1,0 +1,226 @@
+"""Which visits are one place, by annealing: a guess, close to the truth where the robot was at most places often, and without a proof.
+
+>>> from ssh_abduction import Theory, Trace
+>>> from ssh_abduction.annealing import annealed
+>>> from ssh_abduction.chart import Chart
+>>> from ssh_abduction.replay import Log
+>>> views, stars = ["wall", "hall"] * 3, [[0, 0, 1, 0], [1, 0, 0, 0]] * 3
+>>> trace = Trace.from_steps(views, ["around", "travel", "around", "travel", "around"], stars=stars)
+>>> guess = annealed(Chart.framed(trace, Log(trace, Theory(star="frame"))))
+>>> guess.sure.tolist()
+[True, True, True]
+
+A map is a hidden Markov model. Its states are the ways that a robot can stand at a place, and an action done there leads to one state:
+of each row of the matrix of transitions one entry is 1. To begin with rows are uncertain (a Dirichlet prior of small weight), and count
+for little; as the temperature falls they count more. A sweep draws the states of stretches of visits anew, given the rows that
+the last draw counts, and the visits before and after the stretch: forward filtering, backward sampling (Scott 2002, "Bayesian methods
+for hidden Markov models"). Stars, and which visits are apart from pinned ones, rule states out from the start. That a travel can be
+made back is not an axiom, but counts as if it had been seen.
+
+Names of places are as in `named.py`: visits that are pairwise apart are places of their own, and each kind of place has spare names.
+There have to be many: places that fall together where names are short do not come apart later.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.apart import clique
+from ssh_abduction.chart import FramedChart
+
+SPARES = 6  # spare names for places of a kind, and more where names would have more than so many
+VISITS = 12  # visits each
+WEIGHT = 0.002  # of the prior: for each of so many states
+STATES = 60  # that an action may lead to
+# As long as some travels lead elsewhere than most such travels do: to what power probabilities are taken in the first of so many sweeps.
+ANNEALED = 2 * ((0.55, 1500), *4 * ((0.65, 300),))
+COLD = 0.95  # to what power in the last of them
+LAST, QUENCHED = 50, 4.0  # sweeps at the end, so that little is left to chance, and to what power then
+STRETCH = 20  # visits that are drawn in one go
+LIKELY = 16  # states that a visit is drawn from: likely ones, chosen anew
+ROUND = 50  # after so many sweeps
+
+States = NDArray[np.int_]
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What annealing came to.
+
+    states  of each visit 4 times the number of a place, and the slot of the place that slot 0 of the visit is
+    sure    of each visit, whether the travels to it and from it lead where most such travels do
+    """
+
+    states: States
+    sure: NDArray[np.bool_]
+
+
+def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Guess:
+    """A guess at the states of all visits. `check` is called now and then, and may raise."""
+    drawn = _Drawn(chart, np.random.default_rng(0))
+    best: tuple[int, Guess] | None = None
+    for first, sweeps in ANNEALED:
+        for sweep in range(sweeps + LAST):
+            check()
+            power = first + (COLD - first) * sweep / sweeps if sweep < sweeps else QUENCHED
+            if sweep % ROUND == 0:
+                drawn.choose(power)
+            drawn.sweep(power)
+        failed = drawn.failed()
+        if best is None or failed < best[0]:
+            best = failed, drawn.guess()
+        if not failed:
+            break
+    assert best is not None
+    return best[1]
+
+
+class _Drawn:
+    """States of all visits, drawn again and again."""
+
+    def __init__(self, chart: FramedChart, random: np.random.Generator) -> None:
+        self._random = random
+        self._visits = np.arange(len(chart.stars))
+        leaves = [chart.leaves[visit] for visit in self._visits[:-1].tolist()]
+        actions = {action: number for number, action in enumerate(dict.fromkeys(action for _, action in leaves))}
+        self._actions = max(1, len(actions))
+        self._slot = np.array([slot for slot, _ in leaves], dtype=int)
+        self._action = np.array([actions[action] for _, action in leaves], dtype=int)
+        self._options = _options(chart)  # visits x states that are possible; -1 where there are fewer
+        self._states = 4 * (int(self._options.max()) // 4 + 1)
+        states = np.arange(self._states)
+        self._back = states ^ 2  # of each state, the one that faces the other way
+        counts = (self._options >= 0).sum(axis=1)
+        self._labels = self._options[self._visits, (random.random(len(counts)) * counts).astype(int)]
+        self._count()
+
+    def guess(self) -> Guess:
+        """The states drawn last. Visits that a travel joins are not sure, if most such travels lead elsewhere."""
+        rows = self._rows(self._labels[:-1], self._visits[:-1])
+        odd = self._counts[rows, self._labels[1:]] < self._counts[rows].max(axis=1)
+        sure = np.ones(len(self._visits), dtype=bool)
+        sure[:-1] &= ~odd
+        sure[1:] &= ~odd
+        return Guess(self._labels, sure)
+
+    def failed(self) -> int:
+        """How many travels do not lead where most travels of the same state and action do."""
+        return int((self._totals - self._counts.max(axis=1)).sum())
+
+    def _rows(self, states: States, visits: States) -> States:
+        """The number of what is done in these states, by state and action, at the end of these visits."""
+        rows: States = (states - states % 4 + (states + self._slot[visits]) % 4) * self._actions + self._action[visits]
+        return rows
+
+    def _count(self) -> None:
+        here, there = self._labels[:-1], self._labels[1:]
+        rows = self._rows(here, self._visits[:-1])
+        back = self._back[there] * self._actions + self._action
+        entries = np.concatenate([rows * self._states + there, back * self._states + self._back[rows // self._actions]])
+        shape = self._states * self._actions, self._states
+        self._counts = np.bincount(entries, minlength=shape[0] * shape[1]).reshape(shape).astype(np.float32)
+        self._totals = self._counts.sum(axis=1)
+
+    def _transitions(self, states: States, power: float) -> NDArray[np.float32]:
+        """visits but the last x states x states of the next: how likely an action leads from one to the other."""
+        rows = self._rows(np.maximum(states[:-1], 0), self._visits[:-1, None])
+        likely: NDArray[np.float32] = self._counts.ravel()[rows[:, :, None] * self._states + np.maximum(states[1:], 0)[:, None, :]]
+        likely += WEIGHT
+        likely /= (self._totals[rows] + np.float32(STATES * WEIGHT))[:, :, None]
+        np.power(likely, np.float32(power), out=likely)
+        likely *= (states[:-1] >= 0)[:, :, None] & (states[1:] >= 0)[:, None, :]
+        return likely
+
+    def choose(self, power: float) -> None:
+        """Choose the states that visits are drawn from: at random, the likely ones sooner, and the last one drawn for sure."""
+        likely = self._transitions(self._options, power)
+        place = (self._options == self._labels[:, None]).argmax(axis=1)
+        starts, lengths = self._stretches(0)
+        ahead = self._filtered(self._options, likely, place, starts, lengths)
+        behind = np.ones_like(ahead)
+        for i in range(int(lengths.max()) - 1, -1, -1):
+            visits = starts[lengths > i] + i
+            visits = visits[visits < self._visits[-1]]
+            last = lengths[lengths > i][: len(visits)] == i + 1
+            within, ends = visits[~last], visits[last]
+            behind[within] = (likely[within] @ behind[within + 1, :, None])[:, :, 0]
+            behind[ends] = likely[ends, :, place[ends + 1]]
+            behind[visits] /= behind[visits].max(axis=1, keepdims=True)
+        rank = np.log(np.maximum(ahead * behind, 1e-30)) + self._random.gumbel(size=ahead.shape)
+        rank[self._options < 0] = -np.inf
+        rank[self._visits, place] = np.inf
+        few = min(LIKELY, rank.shape[1])
+        chosen = np.argpartition(-rank, few - 1, axis=1)[:, :few]
+        self._chosen = np.take_along_axis(self._options, chosen, axis=1)
+        self._place = (self._chosen == self._labels[:, None]).argmax(axis=1)
+
+    def sweep(self, power: float) -> None:
+        """Draw the states of all visits, stretch by stretch."""
+        likely = self._transitions(self._chosen, power)
+        starts, lengths = self._stretches(int(self._random.integers(STRETCH)))
+        ahead = self._filtered(self._chosen, likely, self._place, starts, lengths)
+        place = self._place.copy()
+        for i in range(int(lengths.max()) - 1, -1, -1):
+            visits = starts[lengths > i] + i
+            weights = ahead[visits]
+            before = visits < self._visits[-1]
+            goes_on = visits[before]
+            weights[before] *= likely[goes_on, :, place[goes_on + 1]]
+            sums = weights.cumsum(axis=1)
+            drawn = (sums < self._random.random((len(visits), 1)) * sums[:, -1:]).sum(axis=1)
+            place[visits] = np.minimum(drawn, sums.shape[1] - 1)
+        self._place = place
+        self._labels = self._chosen[self._visits, place]
+        self._count()
+
+    def _stretches(self, first: int) -> tuple[States, States]:
+        """Where stretches of visits start, and how long they are."""
+        starts = np.unique(np.append(0, np.arange(first, len(self._visits), STRETCH)))
+        return starts, np.diff(np.append(starts, len(self._visits)))
+
+    def _filtered(self, states: States, likely: NDArray[np.float32], place: States, starts: States, lengths: States) -> NDArray[np.float32]:
+        """visits x states: how likely a visit is in a state, given what comes before it in its stretch and the visit before that."""
+        ahead = (states >= 0).astype(np.float32)
+        for i in range(int(lengths.max())):
+            visits = starts[lengths > i] + i
+            if i:
+                ahead[visits] = (ahead[visits - 1, None, :] @ likely[visits - 1])[:, 0]
+            else:
+                ahead[visits[1:]] = likely[visits[1:] - 1, place[visits[1:] - 1]]
+            ahead[visits] /= ahead[visits].sum(axis=1, keepdims=True)
+        return ahead
+
+
+def _options(chart: FramedChart) -> States:
+    """The states that each visit may be in."""
+    fits: dict[tuple[int, int], list[int]] = {}  # by two visits: the slots of the second that slot 0 of the first may be
+    apart = np.ones((len(chart.stars), len(chart.stars)), dtype=bool)
+    for i, j, r in chart.fits():
+        fits.setdefault((i, j), []).append(r)
+        fits.setdefault((j, i), []).append(-r % 4)
+        apart[i, j] = apart[j, i] = False
+    np.fill_diagonal(apart, False)
+    pinned = {visit: place for place, visit in enumerate(clique(apart, [0] * len(apart)))}
+    # The star of each visit in a frame whose slot r is slot 0 of the visit, and its kind: the least of them.
+    turned = [[tuple(star[(slot - r) % 4] for slot in range(4)) for r in range(4)] for star in chart.stars]
+    kinds = [min(stars) for stars in turned]
+    named = Counter(kinds[visit] for visit in pinned)
+    spare: dict[tuple[int, ...], range] = {}
+    names = len(pinned)
+    for kind, visits in Counter(kinds).items():
+        spare[kind] = range(names, names + SPARES + max(0, visits // VISITS - named[kind]))
+        names = spare[kind].stop
+    options: list[list[int]] = []
+    for visit, kind in enumerate(kinds):
+        known = [4 * place + r for other, place in pinned.items() for r in fits.get((visit, other), ())]
+        new = [4 * place + r for place in spare[kind] for r in range(4) if turned[visit][r] == kind]
+        options.append([4 * pinned[visit]] if visit in pinned else known + new)
+    padded = np.full((len(options), max(map(len, options))), -1)
+    for visit, states in enumerate(options):
+        padded[visit, : len(states)] = states
+    return padded
