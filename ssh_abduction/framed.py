@@ -59,6 +59,7 @@ class FramedEngine(SameEngine):
         super().__init__(trace, theory, watch, log, speedups)
         self.paths = len(trace)  # names for paths are never short
         self._guessed = False  # whether a map was
+        self._street_seconds = 0.0  # what the last control for streets took, which cannot be stopped meanwhile
         self._framed = True  # whether the visits fit their frames
         self._best: tuple[tuple[int, ...], list[_Naming]] | None = None  # the minimal cost, and all namings that have it
 
@@ -177,13 +178,15 @@ class FramedEngine(SameEngine):
 
     def _street_control(self, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None) -> clingo.Control:
         """A control for the streets that fit the labels of all nodes, or of these."""
+        self._watch.check(self._street_seconds)
         began = time.perf_counter()
         control = self._streets_of(self._chart, options)
         control.load(encodings.path("preference"))
         control.add("base", [], facts.settled_facts(self._theory, self._chart, labels, range(len(labels)) if nodes is None else nodes))
         control.ground([("base", []), ("least", [])])
         self._watch.check()
-        self.ground_seconds += time.perf_counter() - began
+        self._street_seconds = time.perf_counter() - began
+        self.ground_seconds += self._street_seconds
         return control
 
     def _forbid(self, labels: Sequence[int]) -> None:
