@@ -23,9 +23,11 @@ There have to be many: places that fall together where names are short do not co
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +35,13 @@ from numpy.typing import NDArray
 from ssh_abduction.apart import clique
 from ssh_abduction.chart import FramedChart
 
-SPARES = 6  # spare names for places of a kind, and more where names would have more than so many
+SPARES = 6  # spare names for places of a kind, as many more with each attempt, and more where names would have more than so many
 VISITS = 12  # visits each
 WEIGHT = 0.002  # of the prior: for each of so many states
 STATES = 60  # that an action may lead to
-# As long as some travels lead elsewhere than most such travels do: to what power probabilities are taken in the first of so many sweeps.
-ANNEALED = 2 * ((0.55, 1500), *4 * ((0.65, 300),))
+# An attempt ends where all travels lead where most such travels do. To what power probabilities are taken in the first of so many sweeps:
+ANNEALED = ((0.55, 1500), *4 * ((0.65, 300),))
+SECONDS = 10.0  # after which there is no other attempt
 COLD = 0.95  # to what power in the last of them
 LAST, QUENCHED = 50, 4.0  # sweeps at the end, so that little is left to chance, and to what power then
 STRETCH = 20  # visits that are drawn in one go
@@ -62,19 +65,23 @@ class Guess:
 
 def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Guess:
     """A guess at the states of all visits. `check` is called now and then, and may raise."""
-    drawn = _Drawn(chart, np.random.default_rng(0))
     best: tuple[int, Guess] | None = None
-    for first, sweeps in ANNEALED:
-        for sweep in range(sweeps + LAST):
-            check()
-            power = first + (COLD - first) * sweep / sweeps if sweep < sweeps else QUENCHED
-            if sweep % ROUND == 0:
-                drawn.choose(power)
-            drawn.sweep(power)
-        failed = drawn.failed()
-        if best is None or failed < best[0]:
-            best = failed, drawn.guess()
-        if not failed:
+    began = time.perf_counter()
+    for attempt in count(1):
+        drawn = _Drawn(chart, attempt * SPARES, np.random.default_rng(attempt))
+        for first, sweeps in ANNEALED:
+            for sweep in range(sweeps + LAST):
+                check()
+                power = first + (COLD - first) * sweep / sweeps if sweep < sweeps else QUENCHED
+                if sweep % ROUND == 0:
+                    drawn.choose(power)
+                drawn.sweep(power)
+            failed = drawn.failed()
+            if best is None or failed < best[0]:
+                best = failed, drawn.guess()
+            if not failed:
+                return best[1]
+        if time.perf_counter() - began > SECONDS:
             break
     assert best is not None
     return best[1]
@@ -83,7 +90,7 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Gu
 class _Drawn:
     """States of all visits, drawn again and again."""
 
-    def __init__(self, chart: FramedChart, random: np.random.Generator) -> None:
+    def __init__(self, chart: FramedChart, spares: int, random: np.random.Generator) -> None:
         self._random = random
         self._visits = np.arange(len(chart.stars))
         leaves = [chart.leaves[visit] for visit in self._visits[:-1].tolist()]
@@ -91,7 +98,7 @@ class _Drawn:
         self._actions = max(1, len(actions))
         self._slot = np.array([slot for slot, _ in leaves], dtype=int)
         self._action = np.array([actions[action] for _, action in leaves], dtype=int)
-        self._options = _options(chart)  # visits x states that are possible; -1 where there are fewer
+        self._options = _options(chart, spares)  # visits x states that are possible; -1 where there are fewer
         self._states = 4 * (int(self._options.max()) // 4 + 1)
         states = np.arange(self._states)
         self._back = states ^ 2  # of each state, the one that faces the other way
@@ -196,7 +203,7 @@ class _Drawn:
         return ahead
 
 
-def _options(chart: FramedChart) -> States:
+def _options(chart: FramedChart, spares: int) -> States:
     """The states that each visit may be in."""
     fits: dict[tuple[int, int], list[int]] = {}  # by two visits: the slots of the second that slot 0 of the first may be
     apart = np.ones((len(chart.stars), len(chart.stars)), dtype=bool)
@@ -213,7 +220,7 @@ def _options(chart: FramedChart) -> States:
     spare: dict[tuple[int, ...], range] = {}
     names = len(pinned)
     for kind, visits in Counter(kinds).items():
-        spare[kind] = range(names, names + SPARES + max(0, visits // VISITS - named[kind]))
+        spare[kind] = range(names, names + spares + max(0, visits // VISITS - named[kind]))
         names = spare[kind].stop
     options: list[list[int]] = []
     for visit, kind in enumerate(kinds):

@@ -230,7 +230,7 @@ class SameEngine(ChartedEngine):
     def _labels_near(self, guess: Guess) -> Iterator[tuple[int, ...]]:
         """Labels of all nodes where visits that the guess is sure of, and has at one place, are one; then others, with few dstates.
 
-        First, no others are one where that can be. Then clingo is asked for no lone nodes; of those that a core shows to be too many, one
+        First, no others are one where that can be, until these are labels of a map. Then clingo is asked for no lone nodes; of those that a core shows to be too many, one
         is left alone. Visits of places that cannot all be as guessed are let free.
         """
         members: dict[int, list[int]] = {}
@@ -262,7 +262,7 @@ class SameEngine(ChartedEngine):
                 self._close(threes)
             else:
                 yield self._labels(answer or ())
-                if not patient:
+                if self._known and not patient:
                     patient, avoided = True, set(self._avoided)
 
     def _together_impossible(self, places: list[int], place_of: Mapping[int, int]) -> list[int]:

@@ -109,7 +109,7 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         prefixes,
         patch.multiple(same, **cores),
         patch.multiple(framed, **streets),
-        patch.multiple(annealing, ANNEALED=((0.5, data.draw(st.integers(1, 20), label="sweeps")),), LAST=2),
+        patch.multiple(annealing, ANNEALED=((0.5, data.draw(st.integers(1, 20), label="sweeps")),), LAST=2, SECONDS=0.0),
         patch.object(FramedEngine, "_charted", charted),
     ):
         search = Search(trace, theory, maps=0, speedups=Speedups.without(off))
@@ -443,7 +443,7 @@ def test_a_guess_holds_the_stars(trace: Trace, sweeps: int) -> None:
         chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
     except NoFrame:
         return
-    with patch.multiple(annealing, ANNEALED=((0.5, sweeps),), LAST=1):
+    with patch.multiple(annealing, ANNEALED=((0.5, sweeps),), LAST=1, SECONDS=0.0):
         guess = annealed(chart)
     assert len(guess.states) == len(guess.sure) == len(chart.stars)
     stars: dict[int, tuple[int, ...]] = {}
