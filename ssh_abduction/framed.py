@@ -108,7 +108,7 @@ class FramedEngine(SameEngine):
             return self._minimal_labels()
 
     def _guesses(self) -> Iterator[Found]:
-        """Maps with few dstates, if annealing leads to any, each better than the one before."""
+        """Maps near what annealing guesses, if it leads to any, each with fewer dstates than the one before; then better streets for the last."""
         mode = "opt" if len(self._theory.priorities) > 1 else "ignore"
         for labels, _ in zip(self._labels_near(annealed(self._chart, self._watch.check)), range(GUESSES), strict=False):
             if self._known and len(set(labels)) >= len(set(self._known)):

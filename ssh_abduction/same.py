@@ -54,7 +54,7 @@ _Turned: TypeAlias = dict[int, dict[int, int]]  # of visits that are the same: w
 
 
 class TakesLong(Exception):  # noqa: N818 - not an error
-    """Clingo was asked often, and has not found the fewest dstates yet."""
+    """Clingo has not found the fewest dstates yet, and a map may be found sooner."""
 
 
 class SameEngine(ChartedEngine):
@@ -230,8 +230,8 @@ class SameEngine(ChartedEngine):
     def _labels_near(self, guess: Guess) -> Iterator[tuple[int, ...]]:
         """Labels of all nodes where visits that the guess is sure of, and has at one place, are one; then others, with few dstates.
 
-        First, no others are one where that can be, until these are labels of a map. Then clingo is asked for no lone nodes; of those that a core shows to be too many, one
-        is left alone. Visits of places that cannot all be as guessed are let free.
+        First, no others are one where that can be, until these are labels of a map. Then clingo is asked for no lone nodes; of those that a
+        core shows to be too many, one is left alone. Visits of places that cannot all be as guessed are let free.
         """
         members: dict[int, list[int]] = {}
         for visit in guess.sure.nonzero()[0].tolist():
