@@ -17,7 +17,7 @@ import time
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, islice
 
 import clingo
 
@@ -109,18 +109,19 @@ class FramedEngine(SameEngine):
 
     def _guesses(self) -> Iterator[Found]:
         """Maps near what annealing guesses, if it leads to any, each with fewer dstates than the one before; then better streets for the last."""
-        mode = "opt" if len(self._theory.priorities) > 1 else "ignore"
-        for labels, _ in zip(self._labels_near(annealed(self._chart, self._watch.check)), range(GUESSES), strict=False):
+        best: _Naming | None = None
+        for labels in islice(self._labels_near(annealed(self._chart, self._watch.check)), GUESSES):
             if self._known and len(set(labels)) >= len(set(self._known)):
                 break
-            found = next(self._streets(_Naming(list(labels), None), mode), None)
+            naming = _Naming(list(labels), self._street_control(labels))
+            found = next(self._better_streets(naming), None)
             if found is None:
                 self._forbid(labels)
             else:
-                self._known = labels
+                self._known, best = labels, naming
                 yield found
-        if self._known:
-            yield from self._streets(_Naming(list(self._known), None), mode, GUESSING)
+        if best and len(self._theory.priorities) > 1:
+            yield from self._streets(best, "opt", GUESSING)
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         if not self._framed:

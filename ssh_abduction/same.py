@@ -25,7 +25,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
 from typing import Self, TypeAlias
 
 import clingo
@@ -176,9 +175,9 @@ class SameEngine(ChartedEngine):
             if not patient and self.ground_seconds + self.solve_seconds > PATIENCE:
                 raise TakesLong
             answer, core = self._verdict(self._pairs, list(self._avoided), -1 if patient else MANY_CONFLICTS)
-            if core is None and answer is None and not patient:
-                raise TakesLong
             if core is None:
+                if answer is None:  # the conflicts were too many
+                    raise TakesLong
                 return answer
             if not core:
                 return None
@@ -233,20 +232,15 @@ class SameEngine(ChartedEngine):
         First, no others are one where that can be, until these are labels of a map. Then clingo is asked for no lone nodes; of those that a
         core shows to be too many, one is left alone. Visits of places that cannot all be as guessed are let free.
         """
-        members: dict[int, list[int]] = {}
-        for visit in guess.sure.nonzero()[0].tolist():
-            members.setdefault(int(guess.states[visit]) // 4, []).append(visit)
+        states, sure = guess.states.tolist(), guess.sure.tolist()
         place_of: dict[int, int] = {}  # by the literal that two of its visits are one
-        for place, visits in members.items():
-            pairs = [(i, j, int(guess.states[i] - guess.states[j]) % 4) for i, j in combinations(visits, 2)]
-            place_of |= {self._transitive.literals[pair]: place for pair in pairs if pair in self._transitive.literals}
-        avoided = {
-            -literal
-            for (i, j, r), literal in self._transitive.literals.items()
-            if guess.sure[i]
-            and guess.sure[j]
-            and (guess.states[i] // 4 != guess.states[j] // 4 or (guess.states[i] - guess.states[j]) % 4 != r)
-        }
+        avoided: set[int] = set()
+        for (i, j, r), literal in self._transitive.literals.items():
+            if sure[i] and sure[j]:
+                if states[i] // 4 == states[j] // 4 and (states[i] - states[j]) % 4 == r:
+                    place_of[literal] = states[i] // 4
+                else:
+                    avoided.add(-literal)
         patient = False
         while True:
             answer, core = self._verdict(self._pairs, [*place_of, *avoided])
