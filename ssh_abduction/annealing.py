@@ -41,6 +41,8 @@ WEIGHT = 0.002  # of the prior: for each of so many states
 STATES = 60  # that an action may lead to
 # An attempt ends where all travels lead where most such travels do. To what power probabilities are taken in the first of so many sweeps:
 ANNEALED = ((0.55, 1500), *4 * ((0.65, 300),))
+# The same, and how many visits each name has, and of how many travels one may lead elsewhere, where a rough guess will do:
+ROUGH, ROUGH_VISITS, FEW = 5 * ((0.6, 300),), 40, 200
 SECONDS = 10.0  # after which there is no other attempt
 COLD = 0.95  # to what power in the last of them
 LAST, QUENCHED = 50, 4.0  # sweeps at the end, so that little is left to chance, and to what power then
@@ -62,14 +64,22 @@ class Guess:
     states: States
     sure: NDArray[np.bool_]
 
+    def labels(self, chart: FramedChart) -> list[int]:
+        """A number for the dstate of each node of the chart; -1 where the guess is not sure."""
+        states, sure = self.states.tolist(), self.sure.tolist()
+        return [states[visit] - states[visit] % 4 + (states[visit] + slot) % 4 if sure[visit] else -1 for visit, slot in chart.facing]
 
-def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Guess:
-    """A guess at the states of all visits. `check` is called now and then, and may raise."""
+
+def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False) -> Guess:
+    """A guess at the states of all visits. `check` is called now and then, and may raise.
+
+    rough  be content with fewer names, if places were visited often, with fewer sweeps, and with a few travels that lead elsewhere
+    """
     best: tuple[int, Guess] | None = None
     began = time.perf_counter()
     for attempt in count(1):
-        drawn = _Drawn(chart, attempt * SPARES, np.random.default_rng(attempt))
-        for first, sweeps in ANNEALED:
+        drawn = _Drawn(chart, attempt * SPARES, ROUGH_VISITS if rough else VISITS, np.random.default_rng(attempt))
+        for first, sweeps in ROUGH if rough else ANNEALED:
             for sweep in range(sweeps + LAST):
                 check()
                 power = first + (COLD - first) * sweep / sweeps if sweep < sweeps else QUENCHED
@@ -79,7 +89,7 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Gu
             failed = drawn.failed()
             if best is None or failed < best[0]:
                 best = failed, drawn.guess()
-            if not failed:
+            if failed <= (len(chart.travels) // FEW if rough else 0):
                 return best[1]
         if time.perf_counter() - began > SECONDS:
             break
@@ -90,7 +100,7 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Gu
 class _Drawn:
     """States of all visits, drawn again and again."""
 
-    def __init__(self, chart: FramedChart, spares: int, random: np.random.Generator) -> None:
+    def __init__(self, chart: FramedChart, spares: int, visits: int, random: np.random.Generator) -> None:
         self._random = random
         self._visits = np.arange(len(chart.stars))
         leaves = [chart.leaves[visit] for visit in self._visits[:-1].tolist()]
@@ -98,7 +108,7 @@ class _Drawn:
         self._actions = max(1, len(actions))
         self._slot = np.array([slot for slot, _ in leaves], dtype=int)
         self._action = np.array([actions[action] for _, action in leaves], dtype=int)
-        self._options = _options(chart, spares)  # visits x states that are possible; -1 where there are fewer
+        self._options = _options(chart, spares, visits)  # visits x states that are possible; -1 where there are fewer
         self._states = 4 * (int(self._options.max()) // 4 + 1)
         states = np.arange(self._states)
         self._back = states ^ 2  # of each state, the one that faces the other way
@@ -203,7 +213,7 @@ class _Drawn:
         return ahead
 
 
-def _options(chart: FramedChart, spares: int) -> States:
+def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
     """The states that each visit may be in."""
     fits: dict[tuple[int, int], list[int]] = {}  # by two visits: the slots of the second that slot 0 of the first may be
     apart = np.ones((len(chart.stars), len(chart.stars)), dtype=bool)
@@ -220,7 +230,7 @@ def _options(chart: FramedChart, spares: int) -> States:
     spare: dict[tuple[int, ...], range] = {}
     names = len(pinned)
     for kind, visits in Counter(kinds).items():
-        spare[kind] = range(names, names + spares + max(0, visits // VISITS - named[kind]))
+        spare[kind] = range(names, names + spares + max(0, visits // visits_each - named[kind]))
         names = spare[kind].stop
     options: list[list[int]] = []
     for visit, kind in enumerate(kinds):

@@ -16,7 +16,7 @@ one node, linked by rotations both ways. Nodes are apart if that follows from wh
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -68,8 +68,36 @@ class Chart:
         return far_apart(apart, self.seen, [action for _, action, _ in self.links])
 
     @staticmethod
-    def framed(trace: Trace, log: Log, size: int | None = None) -> FramedChart:
-        """The chart of the first steps (default all), where places have frames. Raises NoFrame."""
+    def turned(trace: Trace, log: Log, size: int) -> FramedChart:
+        """The chart of the first steps, as if places had frames; what is seen ahead, right, back and left takes the place of stars.
+
+        A guess: the causal theory does not say that turns rotate. Raises NoFrame where some action is neither turn nor travel, or where
+        what is seen after a turn does not follow from what was seen before.
+        """
+        right: dict[int, int] = {}  # by what is seen, what is seen after a turn right
+        for action, before, after in zip(trace.actions[: size - 1], log.seen, log.seen[1:], strict=False):
+            if action.kind is None:
+                raise NoFrame
+            if action.turn in ("right", "left"):
+                seen, then = (before, after) if action.turn == "right" else (after, before)
+                if right.setdefault(seen, then) != then:
+                    raise NoFrame
+        around = {}
+        for seen in dict.fromkeys(log.seen[:size]):
+            views = [seen]
+            while len(views) < 5:
+                views.append(right.get(views[-1], -1))
+            if -1 in views or views.pop() != seen:
+                raise NoFrame
+            around[seen] = views
+        return Chart.framed(trace, log, size, around)
+
+    @staticmethod
+    def framed(trace: Trace, log: Log, size: int | None = None, around: Mapping[int, Sequence[int]] | None = None) -> FramedChart:
+        """The chart of the first steps (default all), where places have frames. Raises NoFrame.
+
+        around  what is seen ahead, right, back and left where something is seen ahead: in the place of stars
+        """
         size = len(trace) if size is None else size
         node: dict[tuple[int, int], int] = {}
         seen: list[int] = []
@@ -82,7 +110,7 @@ class Chart:
                 visit, slot = visit + 1, 0
             elif t:
                 slot = (slot + QUARTERS[action.turn]) % 4
-            openings = trace.steps[t].openings or ()
+            openings = (trace.steps[t].openings if around is None else around[log.seen[t]]) or ()
             star = tuple(int(openings[(k - slot) % 4]) for k in range(4))
             if visit == len(stars):
                 stars.append(star)
@@ -105,7 +133,7 @@ class FramedChart(Chart):
     """A chart of visits.
 
     facing   visit and slot of each node; a slot counts quarters clockwise from how the robot faced as it arrived
-    stars    the openings seen on each visit, by slot
+    stars    what is open on each visit, by slot; or what is seen there
     travels  the links that are travels, in order: the visit's number is that of the travel after it
     elsewhere  pairs of nodes known to be at different places
     """

@@ -162,8 +162,13 @@ def _map(
     )
 
 
-def name_facts(names: Iterable[tuple[int, int]], spares: Iterable[Sequence[int]], leads: Iterable[tuple[int, int, int]]) -> str:
-    """Names with their views; for each view its spare names, the last for the rest; and where an action at a name can lead."""
+def name_facts(
+    names: Iterable[tuple[int, int]], spares: Iterable[Sequence[int]], leads: Iterable[tuple[int, int, int]], ordered: bool = True
+) -> str:
+    """Names with their views; for each view its spare names, the last for the rest; and where an action at a name can lead.
+
+    ordered  whether steps are at spare names in the order of the names; if not, that may be assumed
+    """
     view_of = dict(names)
     leads = list(leads)
     facts = [f"view({name},{view})." for name, view in view_of.items()]
@@ -171,6 +176,7 @@ def name_facts(names: Iterable[tuple[int, int]], spares: Iterable[Sequence[int]]
         facts += [f"spare({name})." for name in spare] + [f"after({r},{s})." for r, s in pairwise(spare)] + [f"rest({spare[-1]})."]
     facts += [f"leads({s},{action},{x})." for s, action, x in leads]
     facts += [f"shows({s},{action},{view})." for s, action, view in {(s, action, view_of[x]) for s, action, x in leads}]
+    facts += ["ordered." if ordered else "{ ordered }."]
     return "\n".join(facts)
 
 
@@ -199,6 +205,21 @@ def watched() -> Symbol:
 def resting(batch: int) -> Symbol:
     """The atom that holds if a step of the batches up to this one is at the rest of its view. Assumed by who asks for such a map."""
     return Function("resting", [Number(batch)])
+
+
+def ordered() -> Symbol:
+    """The atom that steps are at spare names in the order of the names."""
+    return Function("ordered")
+
+
+def named(t: int, name: int) -> Symbol:
+    """The atom that step t is at the dstate of that name."""
+    return Function("is", [Number(t), Number(name)])
+
+
+def used(name: int) -> Symbol:
+    """The atom that a spare name is used."""
+    return Function("used", [Number(name)])
 
 
 def read_names(model: Model) -> dict[int, int]:

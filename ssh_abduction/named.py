@@ -20,6 +20,9 @@ Raising the bound by cores stalls when what is missing can be spread over many v
 CORES conflicts the numbers of dstates are asked for one by one instead, from the bound up: is there an answer that costs no more? If
 there is none, the bound is one higher. The first answer without a rest is a minimal map, as it costs what the bound is; the same
 search then goes on with the other maps.
+
+Beside all that, where the trace lets itself be taken for one of places with frames, a map near a guess is sought (`annealing.py`, `nearby.py`), in
+a thread of its own, or where there is but one processor, first and not for long. Whatever bound meets it ends the search.
 """
 
 from __future__ import annotations
@@ -32,10 +35,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction import facts
+from ssh_abduction.annealing import annealed
 from ssh_abduction.apart import apart_from, clique
-from ssh_abduction.chart import Chart
-from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Watch
+from ssh_abduction.chart import Chart, NoFrame
+from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Stopped, Watch
 from ssh_abduction.merging import merged
+from ssh_abduction.nearby import Beside, NearbyEngine
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
@@ -49,8 +54,14 @@ PATIENCE = 2000  # conflicts after which all links are given
 CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
 
 
+TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside it
+
 Link: TypeAlias = tuple[int, int, int]  # node, action, node
 _Trail: TypeAlias = "tuple[Link, _Trail] | None"
+
+
+class _Settled(Exception):  # noqa: N818 - not an error
+    """A map is known that has as few dstates as the bound."""
 
 
 class NamedEngine(ChartedEngine):
@@ -59,7 +70,9 @@ class NamedEngine(ChartedEngine):
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
         super().__init__(trace, theory, watch, log, speedups)
         self._restart_seconds = 0.0  # what the last new control took
+        self._known: list[int] | None = None  # labels of a map from there
         self._hard = self._one_by_one = False  # whether few conflicts were not enough, and whether raising the bound by cores stalled
+        self._beside: Beside | None = None  # a search for a map near a guess
         self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
 
     def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
@@ -88,6 +101,7 @@ class NamedEngine(ChartedEngine):
         self._may_be = [[pinned[t]] if t in pinned else (~row).nonzero()[0].tolist() for t, row in enumerate(columns)]
         self._far = self._chart.far_apart(apart) if self._speedups.apart and len(seen) <= AT_ONCE else None
         self._one_by_one = self._hard = False
+        self._known = None
         self._spares = dict.fromkeys(seen, SPARES)
         self._links = dict.fromkeys(self._chart.links)
         if self._speedups.lazy:
@@ -114,11 +128,26 @@ class NamedEngine(ChartedEngine):
         if not self._chart.links:
             yield [0]
             return
+        try:
+            yield from self._searched()
+        except _Settled:
+            self._end_beside()
+            yield self._known or []
+        except (Stopped, KeyboardInterrupt):
+            self._end_beside()
+            if self._known:
+                yield self._known
+            raise
+        finally:
+            self._end_beside()
+
+    def _searched(self) -> Iterator[list[int]]:
+        """The same, from this search alone. Raises _Settled where the one beside it has fewest dstates."""
         while not self._one_by_one:
             lazy = len(self._links) < len(self._chart.links)
             answer = None
             most = PATIENCE if lazy else CORES if self._speedups.one_by_one else -1
-            answers = self._answers(facts.read_names, "opt", 0, conflicts=most, on_bound=self._raise_bound)
+            answers = self._answers(facts.read_names, "opt", 0, conflicts=most, on_bound=self._raise_bound, until=self._settled)
             while True:
                 try:
                     answer = next(answers)
@@ -126,7 +155,9 @@ class NamedEngine(ChartedEngine):
                     proven = end.value
                     break
             if not proven or answer is None:
-                self._hard = True
+                if not self._hard:
+                    self._hard = True
+                    yield from self._search_nearby()
                 if not lazy:
                     self._ask_one_by_one()
                     continue
@@ -144,6 +175,66 @@ class NamedEngine(ChartedEngine):
                 self._add(failed)
         yield self._follow(self._first_of_bound())[0]
 
+    def _search_nearby(self) -> Iterator[list[int]]:
+        """Begin to search for a map near a guess, in another thread; or search for a while, and give what is found."""
+        if not self._speedups.annealed or len(self._chart.seen) > AT_ONCE:
+            return
+        try:
+            chart = Chart.turned(self._trace, self._log, self.size)
+        except NoFrame:
+            return
+        beside = self._has_processors()
+        watch = Watch(None, None, lambda: None) if beside else self._watch
+        engine = NearbyEngine(
+            self._trace,
+            self._theory,
+            watch,
+            self._log,
+            self._speedups,
+            chart=self._chart,
+            clique=self.clique,
+            may_be=self._may_be,
+            far=self._far,
+        )
+
+        def guessed() -> list[int]:
+            labels = annealed(chart, watch.check, rough=True).labels(chart)
+            return [labels[node] for node in chart.node_of]
+
+        if beside:
+            self._beside = Beside(engine, watch, guessed)
+            return
+        for labels in engine.fewer(guessed(), TRIES):
+            self._known = labels
+            yield labels
+        if engine.bound:
+            self.bound = max(self.bound or 0, engine.bound)
+            raise _Settled
+
+    def _settled(self) -> bool:
+        """Never. Raises _Settled where the search beside this one has as few dstates as the bound."""
+        if self._beside is not None:
+            self._beside.check()
+            self._known = self._beside.labels
+            self.bound = max(self.bound or 0, self._beside.bound)
+            if self._known and len(set(self._known)) <= self.bound:
+                raise _Settled
+        return False
+
+    def _end_beside(self) -> None:
+        if self._beside is not None:
+            self._beside.end()
+            self._known, self.bound = self._beside.labels, max(self.bound or 0, self._beside.bound)
+            self._beside = None
+
+    def _has_processors(self) -> bool:
+        """Whether a search may have two threads."""
+        if not self._speedups.threads:
+            return False
+        from joblib import cpu_count  # takes its time to load
+
+        return bool(cpu_count() > 1)
+
     def _ask_one_by_one(self) -> None:
         self._one_by_one = True
         self._configure()
@@ -153,18 +244,15 @@ class NamedEngine(ChartedEngine):
         configuration: Any = self._control.configuration
         if self._one_by_one:
             configuration.configuration, configuration.sat_prepro = "crafty", "no"
-        if self._hard and self._speedups.threads:
-            from joblib import cpu_count  # takes its time to load
-
-            if cpu_count() > 1:
-                configuration.solve.parallel_mode = "2,compete"
+        if self._hard and not (self._beside and self._beside.running) and self._has_processors():
+            configuration.solve.parallel_mode = "2,compete"
 
     def _first_of_bound(self) -> dict[int, int]:
         """Raise the bound until there is a map that costs no more. All links are given."""
         self._end_begun()
         while True:
             spares = (self.bound or 0) - len(self.clique)
-            answers = self._answers(facts.read_names, f"enum,{spares},{spares}", 0)
+            answers = self._answers(facts.read_names, f"enum,{spares},{spares}", 0, until=self._settled)
             answer = next(answers, None)
             if answer is None:
                 self._raise_bound([spares + 1])
@@ -187,14 +275,24 @@ class NamedEngine(ChartedEngine):
 
     def settle(self) -> None:
         self._end_begun()
+        self._end_beside()
 
     def _end_begun(self) -> None:
         if self._begun is not None:
             self._begun.close()
             self._begun = None
 
-    def _labels_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
-        """All ways to name the nodes with so many dstates; or `enough` of them, unless that is 0."""
+    def _labels_of(self, dstates: int, enough: int) -> Iterator[list[int]]:
+        """All ways to name the nodes with so many dstates; or `enough` of them, unless that is 0. One that is known comes first."""
+        known = self._known if self._known and len(set(self._known)) == dstates else None
+        if known:
+            yield known
+        if not known or enough != 1:
+            first = _numbered(known or ())
+            yield from (labels for labels in self._listed(dstates, enough) if _numbered(labels) != first)
+
+    def _listed(self, dstates: int, enough: int) -> Iterator[list[int]]:
+        """The same, as clingo lists them."""
         spares = dstates - len(self.clique)
         if spares < 0:
             return
@@ -203,10 +301,9 @@ class NamedEngine(ChartedEngine):
             return
         if not enough or self.bound != dstates:
             self._end_begun()
-        if not enough:
-            while self._needs_rest(spares):
-                pass
         while True:
+            while not enough and self._needs_rest(spares):  # asked again when nodes were added, as these may be at a rest
+                pass
             held: list[list[int]] = []
             failed: Iterable[Link] = ()
             lazy = len(self._links) < len(self._chart.links)
@@ -352,3 +449,9 @@ class NamedEngine(ChartedEngine):
             link, trail = trail
             if link not in self._links:
                 yield link, None
+
+
+def _numbered(labels: Sequence[int]) -> list[int]:
+    """Labels, numbered by their first step."""
+    number: dict[int, int] = {}
+    return [number.setdefault(label, len(number)) for label in labels]

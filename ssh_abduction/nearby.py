@@ -1,0 +1,303 @@
+"""Small maps of the causal theory near a guess, and the proof that there is none with fewer dstates, from the guess outwards.
+
+To find a map of the fewest dstates takes long where all steps are free. So most of them stay where a known map has them. Let a
+dstate be spared: if that cannot be, clingo tells which steps are in the way (a core of assumptions), and the dstates of these
+are free to change, until some steps can move or it is shown that the dstate is needed.
+
+When each dstate is needed, nothing is assumed any more of where steps are, but still how many names each view has: no more than in the known map.
+Then views are allowed more names, one after the other, and in the end any number of dstates (the rest, see `named.py`). Each time clingo is
+asked for a map of fewer dstates in all.
+
+*Claim.* If there is none when everything is allowed, the known map is minimal.
+*Proof.* What is asked then is what `named.py` asks, at a cost of one less: by the claim there, each map of so few dstates is an answer. ∎
+
+To allow everything at once is to ask for a proof that may take hours; what clingo learns from each question makes the next one short.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from typing import Literal, TypeAlias
+
+import clingo
+import numpy as np
+
+from ssh_abduction import facts
+from ssh_abduction.apart import Matrix
+from ssh_abduction.chart import Chart
+from ssh_abduction.engine import ChartedEngine, Stopped, Watch
+from ssh_abduction.replay import Log
+from ssh_abduction.speedups import Speedups
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Trace
+
+CONFLICTS = 2000  # after which a question is left open, at first; then twice as many
+WIDE = 10  # as many times as many, where nothing is assumed of steps
+AT_A_TIME = 500  # links that clingo is given in one go
+
+Labels: TypeAlias = list[int]
+_Guessed: TypeAlias = tuple[int, int] | None  # what is seen at a step, and its label
+_Verdict: TypeAlias = Literal["moved", "needed", "open"]
+
+
+class NearbyEngine(ChartedEngine):
+    """Maps of the first steps near a guess.
+
+    bound  the number of dstates of the last map, once that is proven to be the least
+    """
+
+    def __init__(
+        self,
+        trace: Trace,
+        theory: Theory,
+        watch: Watch,
+        log: Log,
+        speedups: Speedups,
+        *,
+        chart: Chart,
+        clique: Sequence[int],
+        may_be: Sequence[Sequence[int]],
+        far: Matrix | None,
+    ) -> None:
+        super().__init__(trace, theory, watch, log, speedups)
+        self._chart = chart
+        self.clique = list(clique)
+        self._may_be = may_be
+        self._far = far
+        self._labels: Labels = []
+        self._needed: set[int] = set()  # names that cannot be spared
+        self._allowed: list[int] | None = None  # names that do not help, though all are allowed; None before they were tried one by one
+        self._waiting: list[int] = []  # names yet to be allowed
+
+    def fewer(self, guess: Sequence[int], tries: int | None = None) -> Iterator[Labels]:
+        """Labels of all steps, each time fewer. Where the iteration ends, the last are fewest if `bound` says so.
+
+        guess  a label of each step; -1 where it is not known. Need not be a map
+        tries  how often to ask with more conflicts, before it is left open whether there are fewer. None: until all is settled
+        """
+        seen = self._chart.seen
+        actions = [action for _, action, _ in self._chart.links]
+        guessed = followed([None if label < 0 else (view, label) for view, label in zip(seen, guess, strict=True)], seen, actions)
+        name_of = {guessed[node]: name for name, node in reversed(list(enumerate(self.clique)))}
+        extra = dict.fromkeys(key for key in guessed if key is not None and key not in name_of)  # of no step of the clique
+        counts = Counter(view for view, _ in extra)
+        self._take({view: counts[view] for view in dict.fromkeys(seen)})
+        left = {view: iter(spare) for view, spare in self._spare.items()}
+        name_of |= {key: next(left[key[0]]) for key in extra}
+        self._labels = [-1 if key is None else name_of[key] for key in guessed]
+        for allowed in ((), [name for spare in self._spare.values() for name in spare[:-1]]):
+            verdict = self._moved(self._not_allowed(allowed), (), WIDE * CONFLICTS, step_by_step=True)
+            if verdict == "moved":
+                break
+        else:
+            return
+        yield self._labels
+        conflicts, failed = CONFLICTS, 0
+        while failed != tries:
+            yield from self._spared(conflicts)
+            answer = yield from self._widened(conflicts * WIDE)
+            if answer == "needed":
+                self.bound = len(set(self._labels))
+                return
+            if answer == "open":
+                conflicts, failed = 2 * conflicts, failed + 1
+
+    def _take(self, counts: Mapping[int, int]) -> None:
+        """Take a control with so many spare names for each view, one more, and a rest."""
+        seen = self._chart.seen
+        names = [(name, seen[node]) for name, node in enumerate(self.clique)]
+        self._spare: dict[int, range] = {}
+        for view, count in counts.items():
+            self._spare[view] = range(len(names), len(names) + count + 2)
+            names += [(name, view) for name in self._spare[view]]
+        self._rests = {spare[-1] for spare in self._spare.values()}
+        pinned = set(self.clique)
+        self._choices = [options if t in pinned else [*options, *self._spare[seen[t]]] for t, options in enumerate(map(list, self._may_be))]
+        links = self._chart.links
+        leads = {(s, action, x) for t, action, u in links for s in self._choices[t] if s not in self._rests for x in self._choices[u]}
+        base = facts.name_facts(names, self._spare.values(), leads, ordered=False)
+        self._control = self._new_control("names", base, ["--eq=1"])
+        self._used = {name: self._literal(facts.used(name)) for spare in self._spare.values() for name in spare}
+        given: set[int] = set()
+        last: dict[int, int] = {}  # by view, the last step that has a choice
+        self._ordered = self._literal(facts.ordered())
+        for batch, start in enumerate(range(0, len(links), AT_A_TIME)):
+            self._watch.check()
+            part, added = f"batch_{batch}", links[start : start + AT_A_TIME]
+            new = sorted({end for s, _, x in added for end in (s, x)} - given)
+            given.update(new)
+            nodes: list[tuple[int, int, Sequence[int], int | None]] = []
+            for t in new:
+                nodes.append((t, seen[t], self._choices[t], last.get(seen[t])))
+                if t not in pinned:
+                    last[seen[t]] = t
+            far = [(t, int(u)) for t in new for u in np.flatnonzero(self._far[t, :t])] if self._far is not None else []
+            self._control.add(part, [], facts.batch_facts(batch, nodes, added, far))
+            self._control.ground([(part, []), ("more", facts.numbers(batch))])
+
+    def _literal(self, symbol: clingo.Symbol) -> int:
+        atom = self._control.symbolic_atoms[symbol]
+        assert atom is not None
+        return atom.literal
+
+    def _not_allowed(self, allowed: Collection[int]) -> list[int]:
+        """That no names are used but those of the labels, and these."""
+        taken = {*self._labels, *allowed}
+        return [-literal for name, literal in self._used.items() if name not in taken]
+
+    def _moved(self, assumed: Sequence[int], free: Iterable[int], conflicts: int, *, step_by_step: bool = False) -> _Verdict:
+        """Move steps so that this holds; those at names that are not free stay, unless they, or others at their names, are in the way."""
+        free = {-1, *free}
+        literals = [
+            0 if name < 0 or len(self._choices[t]) == 1 or name not in self._choices[t] else self._literal(facts.named(t, name))
+            for t, name in enumerate(self._labels)
+        ]
+        while True:
+            stay = {literal: name for literal, name in zip(literals, self._labels, strict=True) if literal and name not in free}
+            answer, core = self._verdict(facts.read_names, [-self._ordered, *assumed, *stay], conflicts)
+            if answer is not None:
+                self._keep(answer)
+                return "moved"
+            if core is None:
+                return "open"
+            moving = [literal for literal in core if literal in stay]
+            if not moving:
+                return "needed"
+            if step_by_step:
+                literals = [0 if literal in moving else literal for literal in literals]
+            else:
+                free |= {stay[literal] for literal in moving}
+
+    def _keep(self, answer: Mapping[int, int]) -> None:
+        """Take an answer for the labels, where steps are at the first spare names of each view."""
+        taken = set(answer.values())
+        name_of = {name: name for name in range(len(self.clique))}
+        for spare in self._spare.values():
+            name_of |= dict(zip([name for name in spare if name in taken], spare, strict=False))
+        self._labels = [name_of[answer[t]] for t in range(len(answer))]
+        self._allowed = None
+        self._needed = set()
+
+    def _spared(self, conflicts: int) -> Iterator[Labels]:
+        """Labels with one dstate less, and again, while there is one that can be spared; only names that the labels use are allowed."""
+        tried: set[int] = set()
+        while True:
+            count = Counter(self._labels)
+            last = [max(used) for spare in self._spare.values() if (used := [name for name in spare if name in count])]
+            left = [name for name in last if name not in tried and name not in self._needed]
+            if not left:
+                return
+            name = min(left, key=lambda name: (count[name], name))
+            tried.add(name)
+            verdict = self._moved([*self._not_allowed(()), -self._used[name]], {name}, conflicts)
+            if verdict == "moved":
+                tried.clear()
+                yield self._labels
+            elif verdict == "needed":
+                self._needed.add(name)
+
+    def _widened(self, conflicts: int) -> Generator[Labels, None, _Verdict]:
+        """Labels with fewer dstates, if allowing more names leads to some; "needed" if there are none whatever is allowed."""
+        if self._allowed is None:  # first no more names, then each of them alone
+            taken = set(self._labels)
+            more = [name for spare in self._spare.values() for name in spare[:-1] if name not in taken]
+            for names in ((), *((name,) for name in more)):
+                verdict = yield from self._asked(names, conflicts)
+                if verdict == "moved" or (verdict == "open" and not names):
+                    return verdict
+            self._allowed, self._waiting = [], [*more, *(spare[-1] for spare in self._spare.values())]
+        left: list[int] | None = None
+        while self._waiting and left != self._waiting:
+            left, self._waiting = self._waiting, []
+            for name in left:
+                verdict = yield from self._asked((*self._allowed, name), conflicts)
+                if verdict == "moved":
+                    return verdict
+                (self._allowed if verdict == "needed" else self._waiting).append(name)
+        return "open" if self._waiting else "needed"
+
+    def _asked(self, allowed: Collection[int], conflicts: int) -> Generator[Labels, None, _Verdict]:
+        """Labels with fewer dstates that use these names, too."""
+        cost = len(set(self._labels)) - 1 - len(self.clique)
+        if cost < 0:
+            return "needed"
+        answer, core = self._verdict(facts.read_names, [self._ordered, *self._not_allowed(allowed)], conflicts, f"enum,{cost},{cost}")
+        if answer is None:
+            return "open" if core is None else "needed"
+        resting = {name for name in answer.values() if name in self._rests}
+        if not resting:
+            self._keep(answer)
+            yield self._labels
+        else:
+            self._name_more(resting)
+        return "moved"
+
+    def _name_more(self, resting: Collection[int]) -> None:
+        """Take a control with more names for the views of these rests."""
+        before, taken = self._spare, set(self._labels)
+        used = {view: [name for name in spare if name in taken] for view, spare in before.items()}
+        self._take({view: (len(spare) - 1 if spare[-1] in resting else len(used[view])) for view, spare in before.items()})
+        renamed = {old: new for view, names in used.items() for old, new in zip(names, self._spare[view], strict=False)}
+        self._labels = [renamed.get(name, name) for name in self._labels]
+        self._allowed = None
+        self._needed = set()
+
+
+def followed(guess: Sequence[_Guessed], seen: Sequence[int], actions: Sequence[int]) -> list[_Guessed]:
+    """A guess in which steps are where most like actions led, as far as what is seen there agrees.
+
+    Where few steps are guessed wrong, that mends them: from a right one on, all that follow are.
+    """
+    leads: dict[tuple[_Guessed, int], Counter[_Guessed]] = {}
+    for here, action, there in zip(guess, actions, guess[1:], strict=False):
+        if here is not None and there is not None:
+            leads.setdefault((here, action), Counter())[there] += 1
+    most = {key: there.most_common(1)[0][0] for key, there in leads.items()}
+    found = list(guess)
+    for t, action in enumerate(actions):
+        there = most.get((found[t], action))
+        if there is not None and there[0] == seen[t + 1]:
+            found[t + 1] = there
+    return found
+
+
+class Beside:
+    """A search for small maps in a thread of its own: numpy and clingo let go of Python's lock while they work.
+
+    labels  of the last map found, if any
+    """
+
+    def __init__(self, engine: NearbyEngine, watch: Watch, guess: Callable[[], Sequence[int]]) -> None:
+        self.labels: Labels | None = None
+        self._engine, self._watch, self._guess = engine, watch, guess
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    @property
+    def bound(self) -> int:
+        return self._engine.bound or 0
+
+    @property
+    def running(self) -> bool:
+        return self._thread.is_alive()
+
+    def check(self) -> None:
+        """Raise what went wrong there."""
+        if self._error is not None:
+            raise self._error
+
+    def end(self) -> None:
+        self._watch.interrupted = True
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            for labels in self._engine.fewer(self._guess()):
+                self.labels = labels
+        except Stopped:
+            pass
+        except BaseException as error:
+            self._error = error

@@ -1,0 +1,171 @@
+"""Maps near a guess: each is a map, each has fewer dstates, and the last is minimal when the search says so, whatever the guess."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator
+from unittest.mock import Mock, patch
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from instances import maze
+from test_speedups import PLAIN, machines
+
+from ssh_abduction import Speedups, Status, Theory, Trace, engine, facts, named, nearby, solve, solver
+from ssh_abduction.annealing import annealed
+from ssh_abduction.apart import apartness, clique, far_apart
+from ssh_abduction.chart import Chart, NoFrame
+from ssh_abduction.checker import check
+from ssh_abduction.engine import Watch
+from ssh_abduction.nearby import Beside, NearbyEngine
+from ssh_abduction.replay import Log
+
+CAUSAL = Theory.causal()
+
+
+def nearby_engine(trace: Trace) -> NearbyEngine:
+    """One that pins a clique, as named.py does."""
+    log = Log(trace, CAUSAL)
+    apart = apartness(log.seen, log.actions)
+    pinned = clique(apart, log.seen)
+    may_be = [[pinned.index(t)] if t in pinned else (~row[pinned]).nonzero()[0].tolist() for t, row in enumerate(apart)]
+    far = far_apart(apart.copy(), log.seen, log.actions)
+    watch = Watch(None, None, lambda: None)
+    watch.start()
+    return NearbyEngine(trace, CAUSAL, watch, log, Speedups(), chart=Chart.of_steps(log, len(trace)), clique=pinned, may_be=may_be, far=far)
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(machines(most_steps=20), st.data())
+def test_from_any_guess_to_a_minimal_map(trace: Trace, data: st.DataObject) -> None:
+    """Guesses that are no maps, that merge what is apart, or say nothing; with as few conflicts as make most questions be asked again."""
+    if len(trace) == 1:
+        return
+    guess = data.draw(st.lists(st.integers(-1, 4), min_size=len(trace), max_size=len(trace)), label="guess")
+    searched = nearby_engine(trace)
+    with patch.object(nearby, "CONFLICTS", data.draw(st.sampled_from([1, nearby.CONFLICTS]), label="conflicts")):
+        found = list(searched.fewer(guess))
+    fewest = solve(trace, CAUSAL, speedups=PLAIN).cost
+    assert fewest
+    for labels in found:
+        assert check(trace, facts.causal_map(labels, trace), CAUSAL) == ()
+    counts = [len(set(labels)) for labels in found]
+    assert counts == sorted(set(counts), reverse=True)
+    assert counts
+    assert counts[-1] == searched.bound == fewest.dstates
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(machines(), st.booleans(), st.integers(0, 10_000), st.data())
+def test_a_search_beside_another_changes_no_answer(trace: Trace, beside: bool, cores: int, data: st.DataObject) -> None:
+    """In a thread or before; from any guess, right or wrong."""
+    expected = solve(trace, CAUSAL, maps=0, speedups=PLAIN)
+    guess = data.draw(st.lists(st.integers(-1, 3), min_size=len(trace), max_size=len(trace)), label="guess")
+    most = data.draw(st.sampled_from([0, 1, 3]), label="most")
+    turned = Mock(side_effect=lambda _, __, size: Mock(node_of=range(size)))
+    with (
+        patch.object(solver, "FEW_STEPS", 0),
+        patch.object(engine, "FIRST_PREFIXES", len(trace)),
+        patch.multiple(named, PATIENCE=0, CORES=cores, TRIES=data.draw(st.integers(1, 3), label="tries")),
+        patch.object(named, "annealed", lambda *_, **__: Mock(labels=lambda _: guess)),
+        patch.object(named.Chart, "turned", turned),
+        patch.object(named.NamedEngine, "_has_processors", lambda _: beside),
+    ):
+        found = solve(trace, CAUSAL, maps=most)
+    assert found.status is Status.OPTIMAL
+    assert found.bound == expected.bound
+    assert set(found.maps) <= set(expected.maps)
+    assert found.count == len(set(found.maps)) == (min(most, expected.count) if most else expected.count)
+    assert found.complete == (not most or expected.count <= most)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_causal_maze_is_guessed_by_its_turns(seed: int) -> None:
+    """Annealing, from views and turns alone, comes near what the robot was in; from there to the proof that no fewer dstates will do."""
+    walk = maze(3, 3, steps=1600, seed=seed)
+    log = Log(walk.trace, CAUSAL)
+    chart = Chart.turned(walk.trace, log, len(log.seen))
+    labels = annealed(chart, rough=True).labels(chart)
+    guess = [labels[node] for node in chart.node_of]
+    same = sum(guess[t] >= 0 for t in range(len(guess)))
+    assert same > 0.9 * len(guess)
+    searched = nearby_engine(walk.trace)
+    found = list(searched.fewer(guess))
+    fewest = solve(walk.trace, CAUSAL, speedups=Speedups.without("annealed")).cost
+    assert fewest
+    assert len(set(found[-1])) == searched.bound == fewest.dstates
+    assert check(walk.trace, facts.causal_map(found[-1], walk.trace), CAUSAL) == ()
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
+    """The robot was in 100 states; what is merged at once has more."""
+    walk = maze(5, 5, steps=1600, seed=0)
+    best: list[int] = []
+
+    def stop(self: NearbyEngine, *_: object) -> Generator[list[int], None, str]:
+        """When there is a small map, the time is over."""
+        best.append(len(set(self._labels)))
+        limited.interrupt()
+        while not self._watch.interrupted:
+            time.sleep(0.001)
+        self._watch.check()
+        yield []
+        return "open"
+
+    limited = solver.Search(walk.trace, CAUSAL)
+    truth = {state: number for number, state in enumerate(dict.fromkeys(walk.truth))}
+    with (
+        patch.object(named, "annealed", lambda *_, **__: Mock(labels=lambda chart: _labels_of(chart, walk.truth, truth))),
+        patch.object(NearbyEngine, "_asked", stop),
+        patch.object(named.NamedEngine, "_has_processors", lambda _: beside),
+    ):
+        solution = limited.solution(tuple(limited))
+    assert solution.stopped == "interrupted"
+    assert solution.cost
+    assert solution.cost.dstates == best[0] <= 100
+    assert check(walk.trace, solution.maps[0], CAUSAL) == ()
+
+
+def _labels_of(chart: Chart, states: tuple[object, ...], number: dict[object, int]) -> list[int]:
+    labels = [-1] * len(chart.seen)
+    for node, state in zip(chart.node_of, states, strict=True):
+        labels[node] = number[state]
+    return labels
+
+
+def test_what_goes_wrong_in_the_thread_is_raised_where_the_result_is_asked_for() -> None:
+    trace = Trace.from_steps("abab", ["travel", "right", "travel"])
+
+    def guess() -> list[int]:
+        raise ZeroDivisionError
+
+    beside = Beside(nearby_engine(trace), Watch(None, None, lambda: None), guess)
+    while beside.running:
+        time.sleep(0.001)
+    with pytest.raises(ZeroDivisionError):
+        beside.check()
+    beside.end()
+
+
+@pytest.mark.parametrize(
+    ("views", "actions"),
+    [
+        ("abc", [{"name": "travel", "kind": "travel"}, {"name": "go"}]),  # neither turn nor travel
+        ("ababc", ["right", "travel", "right", "right"]),  # to the right of b are a and c
+        ("abc", ["right", "right"]),  # not seen what is to the right of c
+        ("abcab", ["right", "right", "right", "right"]),  # three quarters round
+    ],
+)
+def test_no_frame_is_guessed(views: str, actions: list[object]) -> None:
+    trace = Trace.from_steps(views, actions)
+    with pytest.raises(NoFrame):
+        Chart.turned(trace, Log(trace, CAUSAL), len(trace))
+
+
+def test_a_chart_of_what_is_seen_around() -> None:
+    trace = Trace.from_steps("abab", ["right", "travel", "left"])
+    chart = Chart.turned(trace, Log(trace, CAUSAL), 4)
+    assert chart.stars == ((0, 1, 0, 1), (0, 1, 0, 1))
+    assert chart.node_of == (0, 1, 2, 3)
