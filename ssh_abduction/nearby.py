@@ -2,7 +2,8 @@
 
 To find a map of the fewest dstates takes long where all steps are free. So most of them stay where a known map has them. Let a
 dstate be spared: if that cannot be, clingo tells which steps are in the way (a core of assumptions), and the dstates of these
-are free to change, until some steps can move or it is shown that the dstate is needed.
+are free to change, until some steps can move or it is shown that the dstate is needed. Where that is left open, all steps of some part of the
+map are free at once, of parts as large as can be settled soon (large neighbourhood search: Shaw 1998).
 
 When each dstate is needed, nothing is assumed any more of where steps are, but still how many names each view has: no more than in the known map.
 Then views are allowed more names, one after the other, and in the end any number of dstates (the rest, see `named.py`). Each time clingo is
@@ -16,9 +17,11 @@ To allow everything at once is to ask for a proof that may take hours; what clin
 
 from __future__ import annotations
 
+import random
 import threading
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Literal, TypeAlias
 
 import clingo
@@ -35,6 +38,8 @@ from ssh_abduction.trace import Trace
 
 CONFLICTS = 2000  # after which a question is left open, at first; then twice as many
 WIDE = 10  # as many times as many, where nothing is assumed of steps
+REGIONS = 40  # parts of the map that are drawn anew in vain, before anything else is tried
+FIRST_REGION = 10  # dstates of such a part, at first
 AT_A_TIME = 500  # links that clingo is given in one go
 
 Labels: TypeAlias = list[int]
@@ -70,6 +75,8 @@ class NearbyEngine(ChartedEngine):
         self._needed: set[int] = set()  # names that cannot be spared
         self._allowed: list[int] | None = None  # names that do not help, though all are allowed; None before they were tried one by one
         self._waiting: list[int] = []  # names yet to be allowed
+        self._region = FIRST_REGION
+        self._random = random.Random(0)
 
     def fewer(self, guess: Sequence[int], tries: int | None = None) -> Iterator[Labels]:
         """Labels of all steps, each time fewer. Where the iteration ends, the last are fewest if `bound` says so.
@@ -102,6 +109,8 @@ class NearbyEngine(ChartedEngine):
                 self.bound = len(set(self._labels))
                 return
             if answer == "open":
+                if self._allowed is None:
+                    yield from self._redrawn(CONFLICTS)
                 conflicts, failed = 2 * conflicts, failed + 1
 
     def _take(self, counts: Mapping[int, int]) -> None:
@@ -150,10 +159,7 @@ class NearbyEngine(ChartedEngine):
     def _moved(self, assumed: Sequence[int], free: Iterable[int], conflicts: int, *, step_by_step: bool = False) -> _Verdict:
         """Move steps so that this holds; those at names that are not free stay, unless they, or others at their names, are in the way."""
         free = {-1, *free}
-        literals = [
-            0 if name < 0 or len(self._choices[t]) == 1 or name not in self._choices[t] else self._literal(facts.named(t, name))
-            for t, name in enumerate(self._labels)
-        ]
+        literals = self._literals()
         while True:
             stay = {literal: name for literal, name in zip(literals, self._labels, strict=True) if literal and name not in free}
             answer, core = self._verdict(facts.read_names, [-self._ordered, *assumed, *stay], conflicts)
@@ -169,6 +175,13 @@ class NearbyEngine(ChartedEngine):
                 literals = [0 if literal in moving else literal for literal in literals]
             else:
                 free |= {stay[literal] for literal in moving}
+
+    def _literals(self) -> list[int]:
+        """Of each step, that it is where its label says; 0 where there is no choice."""
+        return [
+            0 if name < 0 or len(self._choices[t]) == 1 or name not in self._choices[t] else self._literal(facts.named(t, name))
+            for t, name in enumerate(self._labels)
+        ]
 
     def _keep(self, answer: Mapping[int, int]) -> None:
         """Take an answer for the labels, where steps are at the first spare names of each view."""
@@ -197,6 +210,38 @@ class NearbyEngine(ChartedEngine):
                 yield self._labels
             elif verdict == "needed":
                 self._needed.add(name)
+
+    def _redrawn(self, conflicts: int) -> Iterator[Labels]:
+        """Labels with fewer dstates where the steps of dstates that lead to each other are free, from some spare name on, and all others stay."""
+        tried = 0
+        while tried < REGIONS:
+            tried += 1
+            taken = set(self._labels)
+            begin = sorted(taken.difference(range(len(self.clique))))
+            if not begin:
+                return
+            near: dict[int, set[int]] = {}
+            for here, there in pairwise(self._labels):
+                near.setdefault(here, set()).add(there)
+                near.setdefault(there, set()).add(here)
+            edge = [self._random.choice(begin)]
+            free = set(edge)
+            while edge and len(free) < self._region:
+                for name in sorted(near[edge.pop(self._random.randrange(len(edge)))] - free)[: self._region - len(free)]:
+                    free.add(name)
+                    edge.append(name)
+            stay = [literal for literal, name in zip(self._literals(), self._labels, strict=True) if literal and name not in free]
+            cost = len(taken) - 1 - len(self.clique)
+            assumed = [-self._ordered, *self._not_allowed(()), *stay]
+            answer, core = self._verdict(facts.read_names, assumed, conflicts, f"enum,{cost},{cost}")
+            if answer is not None:
+                self._keep(answer)
+                yield self._labels
+                tried = 0
+            elif core is not None:
+                self._region = min(self._region + 2, len(taken))
+            else:
+                self._region = max(self._region - 4, FIRST_REGION)
 
     def _widened(self, conflicts: int) -> Generator[Labels, None, _Verdict]:
         """Labels with fewer dstates, if allowing more names leads to some; "needed" if there are none whatever is allowed."""

@@ -22,7 +22,7 @@ class Speedups:
     core_guided  with names or frames: raise the bound from below, rather than better the map
     small_cores  with frames: make cores smaller, as long as that is cheap
     sides        with frames: say what order and sides forbid while dstates are sought, street by street
-    annealed     with frames: where clingo takes its time, a map near a guess, so that a small one is known
+    annealed     with names or frames: where clingo takes its time, a map near a guess, so that a small one is known
     watched      with names or frames: make constraints of three literals longer, so that clasp watches two of them rather than all three
     one_by_one   with names: where that stalls, ask for numbers of dstates one by one
     threads      with names: two threads of clasp, where a trace is hard and there are two processors
