@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 
@@ -163,14 +163,20 @@ def _map(
 
 
 def name_facts(
-    names: Iterable[tuple[int, int]], spares: Iterable[Sequence[int]], leads: Iterable[tuple[int, int, int]], ordered: bool = True
+    names: Iterable[tuple[int, int]],
+    spares: Collection[Sequence[int]],
+    links: Iterable[tuple[int, int, int]],
+    choices: Sequence[Sequence[int]],
+    ordered: bool = True,
 ) -> str:
     """Names with their views; for each view its spare names, the last for the rest; and where an action at a name can lead.
 
+    choices  of each node, the names that it can be at
     ordered  whether steps are at spare names in the order of the names; if not, that may be assumed
     """
     view_of = dict(names)
-    leads = list(leads)
+    rests = {spare[-1] for spare in spares}
+    leads = {(s, action, x) for t, action, u in links for s in choices[t] if s not in rests for x in choices[u]}
     facts = [f"view({name},{view})." for name, view in view_of.items()]
     for spare in spares:
         facts += [f"spare({name})." for name in spare] + [f"after({r},{s})." for r, s in pairwise(spare)] + [f"rest({spare[-1]})."]

@@ -40,21 +40,19 @@ from ssh_abduction.apart import apart_from, clique
 from ssh_abduction.chart import Chart, NoFrame
 from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Stopped, Watch
 from ssh_abduction.merging import merged
-from ssh_abduction.nearby import Beside, NearbyEngine
+from ssh_abduction.nearby import AT_A_TIME, Beside, NearbyEngine
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
 HELD_BACK = 100  # maps that are kept until all links are given; then they stream
-AT_A_TIME = 500  # links that clingo is given in one go
 PREPARING = 0.6  # of the time that grounding took, clingo takes before it begins to solve, and can be stopped
 SPARES = 2  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
 CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
-
-
 TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside it
+
 
 Link: TypeAlias = tuple[int, int, int]  # node, action, node
 _Trail: TypeAlias = "tuple[Link, _Trail] | None"
@@ -70,9 +68,9 @@ class NamedEngine(ChartedEngine):
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
         super().__init__(trace, theory, watch, log, speedups)
         self._restart_seconds = 0.0  # what the last new control took
-        self._known: list[int] | None = None  # labels of a map from there
         self._hard = self._one_by_one = False  # whether few conflicts were not enough, and whether raising the bound by cores stalled
         self._beside: Beside | None = None  # a search for a map near a guess
+        self._known: list[int] | None = None  # labels of a map from there
         self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
 
     def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
@@ -205,27 +203,30 @@ class NamedEngine(ChartedEngine):
             self._beside = Beside(engine, watch, guessed)
             return
         for labels in engine.fewer(guessed(), TRIES):
-            self._known = labels
+            self._heed(labels, 0)
             yield labels
         if engine.bound:
-            self.bound = max(self.bound or 0, engine.bound)
+            self._heed(self._known, engine.bound)
             raise _Settled
 
     def _settled(self) -> bool:
         """Never. Raises _Settled where the search beside this one has as few dstates as the bound."""
         if self._beside is not None:
             self._beside.check()
-            self._known = self._beside.labels
-            self.bound = max(self.bound or 0, self._beside.bound)
-            if self._known and len(set(self._known)) <= self.bound:
+            self._heed(self._beside.labels, self._beside.bound)
+            if self._known and len(set(self._known)) <= (self.bound or 0):
                 raise _Settled
         return False
 
     def _end_beside(self) -> None:
         if self._beside is not None:
             self._beside.end()
-            self._known, self.bound = self._beside.labels, max(self.bound or 0, self._beside.bound)
+            self._heed(self._beside.labels, self._beside.bound)
             self._beside = None
+
+    def _heed(self, labels: list[int] | None, bound: int) -> None:
+        """Take what the search near a guess knows."""
+        self._known, self.bound = labels, max(self.bound or 0, bound)
 
     def _has_processors(self) -> bool:
         """Whether a search may have two threads."""
@@ -356,11 +357,10 @@ class NamedEngine(ChartedEngine):
             options if len(options) == 1 and t == self.clique[options[0]] else options + spares[seen[t]]
             for t, options in enumerate(self._may_be)
         ]
-        leads = {
-            (s, action, x) for t, action, u in self._chart.links for s in self._choices[t] if s not in self._rest for x in self._choices[u]
-        }
         cores = ["--opt-strategy=usc"] if self._speedups.core_guided else []
-        self._control = self._new_control("names", facts.name_facts(names, spares.values(), leads), ["--eq=1", *cores])
+        self._control = self._new_control(
+            "names", facts.name_facts(names, spares.values(), self._chart.links, self._choices), ["--eq=1", *cores]
+        )
         self._configure()
         self._given: set[int] = set()  # nodes
         self._open = np.zeros(len(seen), dtype=bool)  # whether a node is one of them, and not pinned

@@ -125,8 +125,7 @@ class NearbyEngine(ChartedEngine):
         pinned = set(self.clique)
         self._choices = [options if t in pinned else [*options, *self._spare[seen[t]]] for t, options in enumerate(map(list, self._may_be))]
         links = self._chart.links
-        leads = {(s, action, x) for t, action, u in links for s in self._choices[t] if s not in self._rests for x in self._choices[u]}
-        base = facts.name_facts(names, self._spare.values(), leads, ordered=False)
+        base = facts.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
         self._control = self._new_control("names", base, ["--eq=1"])
         self._used = {name: self._literal(facts.used(name)) for spare in self._spare.values() for name in spare}
         given: set[int] = set()
@@ -189,9 +188,10 @@ class NearbyEngine(ChartedEngine):
         name_of = {name: name for name in range(len(self.clique))}
         for spare in self._spare.values():
             name_of |= dict(zip([name for name in spare if name in taken], spare, strict=False))
-        self._labels = [name_of[answer[t]] for t in range(len(answer))]
-        self._allowed = None
-        self._needed = set()
+        self._label([name_of[answer[t]] for t in range(len(answer))])
+
+    def _label(self, labels: Labels) -> None:
+        self._labels, self._allowed, self._needed = labels, None, set()
 
     def _spared(self, conflicts: int) -> Iterator[Labels]:
         """Labels with one dstate less, and again, while there is one that can be spared; only names that the labels use are allowed."""
@@ -231,9 +231,7 @@ class NearbyEngine(ChartedEngine):
                     free.add(name)
                     edge.append(name)
             stay = [literal for literal, name in zip(self._literals(), self._labels, strict=True) if literal and name not in free]
-            cost = len(taken) - 1 - len(self.clique)
-            assumed = [-self._ordered, *self._not_allowed(()), *stay]
-            answer, core = self._verdict(facts.read_names, assumed, conflicts, f"enum,{cost},{cost}")
+            answer, core = self._with_fewer([-self._ordered, *self._not_allowed(()), *stay], conflicts)
             if answer is not None:
                 self._keep(answer)
                 yield self._labels
@@ -265,10 +263,7 @@ class NearbyEngine(ChartedEngine):
 
     def _asked(self, allowed: Collection[int], conflicts: int) -> Generator[Labels, None, _Verdict]:
         """Labels with fewer dstates that use these names, too."""
-        cost = len(set(self._labels)) - 1 - len(self.clique)
-        if cost < 0:
-            return "needed"
-        answer, core = self._verdict(facts.read_names, [self._ordered, *self._not_allowed(allowed)], conflicts, f"enum,{cost},{cost}")
+        answer, core = self._with_fewer([self._ordered, *self._not_allowed(allowed)], conflicts)
         if answer is None:
             return "open" if core is None else "needed"
         resting = {name for name in answer.values() if name in self._rests}
@@ -279,15 +274,20 @@ class NearbyEngine(ChartedEngine):
             self._name_more(resting)
         return "moved"
 
+    def _with_fewer(self, assumed: Sequence[int], conflicts: int) -> tuple[dict[int, int] | None, list[int] | None]:
+        """An answer of fewer dstates where this holds, or a core of it."""
+        cost = len(set(self._labels)) - 1 - len(self.clique)
+        if cost < 0:
+            return None, []
+        return self._verdict(facts.read_names, assumed, conflicts, f"enum,{cost},{cost}")
+
     def _name_more(self, resting: Collection[int]) -> None:
         """Take a control with more names for the views of these rests."""
         before, taken = self._spare, set(self._labels)
         used = {view: [name for name in spare if name in taken] for view, spare in before.items()}
         self._take({view: (len(spare) - 1 if spare[-1] in resting else len(used[view])) for view, spare in before.items()})
         renamed = {old: new for view, names in used.items() for old, new in zip(names, self._spare[view], strict=False)}
-        self._labels = [renamed.get(name, name) for name in self._labels]
-        self._allowed = None
-        self._needed = set()
+        self._label([renamed.get(name, name) for name in self._labels])
 
 
 def followed(guess: Sequence[_Guessed], seen: Sequence[int], actions: Sequence[int]) -> list[_Guessed]:
