@@ -39,10 +39,10 @@ SPARES = 6  # spare names for places of a kind, as many more with each attempt, 
 VISITS = 12  # visits each
 WEIGHT = 0.002  # of the prior: for each of so many states
 STATES = 60  # that an action may lead to
-# An attempt ends where all travels lead where most such travels do. To what power probabilities are taken in the first of so many sweeps:
+# An attempt ends where nearly all travels lead where most such travels do. To what power probabilities are taken in the first of so many sweeps:
 ANNEALED = ((0.55, 1500), *4 * ((0.65, 300),))
-# The same, and how many visits each name has, and of how many travels one may lead elsewhere, where a rough guess will do:
-ROUGH, ROUGH_VISITS, FEW = 5 * ((0.6, 300),), 40, 200
+FEW = 200  # of so many travels one may lead elsewhere
+ROUGH, ROUGH_VISITS = 5 * ((0.6, 300),), 40  # the same, and how many visits each name has, where a rough guess will do
 SECONDS = 10.0  # after which there is no other attempt
 COLD = 0.95  # to what power in the last of them
 LAST, QUENCHED = 50, 4.0  # sweeps at the end, so that little is left to chance, and to what power then
@@ -73,7 +73,7 @@ class Guess:
 def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False) -> Guess:
     """A guess at the states of all visits. `check` is called now and then, and may raise.
 
-    rough  be content with fewer names, if places were visited often, with fewer sweeps, and with a few travels that lead elsewhere
+    rough  be content with fewer names, if places were visited often, and with fewer sweeps
     """
     best: tuple[int, Guess] | None = None
     began = time.perf_counter()
@@ -89,7 +89,7 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, ro
             failed = drawn.failed()
             if best is None or failed < best[0]:
                 best = failed, drawn.guess()
-            if failed <= (len(chart.travels) // FEW if rough else 0):
+            if failed <= len(chart.travels) // FEW:
                 return best[1]
         if time.perf_counter() - began > SECONDS:
             break

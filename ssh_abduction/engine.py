@@ -240,9 +240,14 @@ class Engine:
                 self.solve_seconds += max(0.0, time.perf_counter() - began)
 
     def _verdict(
-        self, read: Callable[[clingo.Model], Answer], assumed: Sequence[int], conflicts: int = -1, mode: str = "ignore"
+        self,
+        read: Callable[[clingo.Model], Answer],
+        assumed: Sequence[int],
+        conflicts: int = -1,
+        mode: str = "ignore",
+        until: Callable[[], bool] = lambda: False,
     ) -> tuple[Answer | None, list[int] | None]:
-        """An answer that these literals are true in, or else a core of them; neither where the limit of conflicts was reached."""
+        """An answer that these literals are true in, or else a core of them; neither where the limit of conflicts was reached, or `until` holds."""
         configuration: Any = self._control.configuration.solve
         configuration.opt_mode, configuration.models, configuration.project = mode, 1, "no"
         configuration.solve_limit = f"{conflicts},-1"
@@ -253,6 +258,8 @@ class Engine:
             try:
                 while not handle.wait(POLL):
                     self._watch.check()
+                    if until():
+                        return None, None
                 self._watch.check()
                 model = handle.model()
                 if model is not None:
@@ -341,6 +348,14 @@ class ChartedEngine(Engine):
     @property
     def size_to_go_on(self) -> int:
         return self.next_size(self.size)
+
+    def _has_processors(self) -> bool:
+        """Whether a search may have two threads."""
+        if not self._speedups.threads:
+            return False
+        from joblib import cpu_count  # takes its time to load
+
+        return bool(cpu_count() > 1)
 
     def _new_control(self, encoding: str, base: str, options: Sequence[str]) -> clingo.Control:
         """A control with an encoding, and these facts in its base."""

@@ -22,9 +22,10 @@ from itertools import combinations, islice
 import clingo
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.annealing import annealed
+from ssh_abduction.annealing import Guess, annealed
 from ssh_abduction.chart import Chart, FramedChart, NoFrame
 from ssh_abduction.engine import Found, Watch
+from ssh_abduction.nearby import Beside, NearbyEngine
 from ssh_abduction.replay import Log
 from ssh_abduction.same import Pair, SameEngine, TakesLong, smaller
 from ssh_abduction.speedups import Speedups
@@ -36,6 +37,8 @@ MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much 
 # clasp's way to list answers in which no atom that is shown can be spared:
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 KEPT = 10  # controls of minimal namings that are kept until their maps are listed: each is some megabytes
+SOON = 1.0  # seconds without the fewest dstates after which a map near a guess is sought beside
+PATIENCE = 5.0  # the same, where that has to be done first
 GUESSABLE = 1_000_000  # visits that may be one, above which annealing takes too much memory
 GUESSES = 20  # labels that are tried, near what annealing guesses
 GUESSING = 1000  # conflicts after which better streets of these are no longer sought
@@ -58,7 +61,10 @@ class FramedEngine(SameEngine):
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
         super().__init__(trace, theory, watch, log, speedups)
         self.paths = len(trace)  # names for paths are never short
-        self._guessed = False  # whether a map was
+        self._guess: Guess | None = None
+        self._guessed = False  # whether maps near the guess were sought
+        self._beside: Beside | None = None  # a search that begins with the guess
+        self._named: NearbyEngine | None = None  # what searches there
         self._street_seconds = 0.0  # what the last control for streets took, which cannot be stopped meanwhile
         self._framed = True  # whether the visits fit their frames
         self._best: tuple[tuple[int, ...], list[_Naming]] | None = None  # the minimal cost, and all namings that have it
@@ -66,6 +72,8 @@ class FramedEngine(SameEngine):
     def grow(self, size: int) -> None:
         if size != self.size:
             self._best = None
+            self._end_beside()
+            self._guess, self._guessed, self._named = None, False, None
         try:
             super().grow(size)
         except NoFrame:
@@ -85,6 +93,7 @@ class FramedEngine(SameEngine):
                 break
             self._forbid(labels)
             labels = yield from self._fewest_dstates()
+        self._end_beside()
         if best is None or labels is None:
             return
         namings = [named]
@@ -99,18 +108,76 @@ class FramedEngine(SameEngine):
 
     def _fewest_dstates(self) -> Generator[Found, None, list[int] | None]:
         """The labels of `_minimal_labels`. Where they take long, maps that are soon found come before."""
-        try:
-            guess = self._speedups.annealed and not self._guessed and len(self._fits) <= GUESSABLE
-            return self._minimal_labels(patient=not guess)
-        except TakesLong:
-            self._guessed = True
-            yield from self._guesses()
-            return self._minimal_labels()
+        while True:
+            try:
+                return self._minimal_labels(self._has_news)
+            except TakesLong:
+                if not self._guessed:
+                    self._guessed = True
+                    yield from self._guesses(self._guess or annealed(self._chart, self._watch.check))
 
-    def _guesses(self) -> Iterator[Found]:
-        """Maps near what annealing guesses, if it leads to any, each with fewer dstates than the one before; then better streets for the last."""
+    def _has_news(self) -> bool:
+        """Whether there is a guess, or it is time for one; or the search beside shows that no map has fewer dstates than the known one."""
+        if self._beside:
+            self._heed(self._beside)
+        if self._guessed:
+            return self._known is not None and self.bound == len(set(self._known))
+        if not self._speedups.annealed or len(self._fits) > GUESSABLE:
+            return False
+        if not self._has_processors():
+            return self._watch.elapsed() > PATIENCE
+        if not self._beside and self._watch.elapsed() > SOON:
+            self._search_beside()
+        return self._guess is not None
+
+    def _search_beside(self) -> None:
+        """Begin to guess in another thread, and to prove from there that the causal axioms need so many dstates."""
+        watch, chart, pinned = Watch(None, None, lambda: None), self._chart, self.clique or [0]
+        apart = chart.apart(len(chart.seen))
+        self._named = NearbyEngine(
+            self._trace,
+            self._theory,
+            watch,
+            self._log,
+            self._speedups,
+            chart=chart,
+            clique=pinned,
+            may_be=[[pinned.index(node)] if node in pinned else (~row).nonzero()[0].tolist() for node, row in enumerate(apart[:, pinned])],
+            far=None,
+        )
+
+        def guessed() -> list[int]:
+            self._guess = annealed(chart, watch.check)
+            return self._guess.labels(chart)
+
+        self._beside = Beside(self._named, watch, guessed)
+
+    def _end_beside(self) -> None:
+        if self._beside:
+            self._beside.end()
+            self._heed(self._beside)
+            self._beside = None
+
+    def _heed(self, beside: Beside) -> None:
+        """Take what the search beside knows."""
+        beside.check()
+        self.bound = max(self.bound or 0, beside.bound)
+
+    def settle(self) -> None:
+        self._end_beside()
+
+    def _labels_of(self, dstates: int) -> Generator[list[int], None, None]:
+        named = self._named_at(dstates)
+        yield from named.listed(self._watch) if named else super()._labels_of(dstates)
+
+    def _named_at(self, dstates: int) -> NearbyEngine | None:
+        """What searched beside, if that alone showed that there are no fewer dstates."""
+        return self._named if self._named and self._named.bound == dstates > self._least else None
+
+    def _guesses(self, guess: Guess) -> Iterator[Found]:
+        """Maps near a guess, if it leads to any, each with fewer dstates than the one before; then better streets for the last."""
         best: _Naming | None = None
-        for labels in islice(self._labels_near(annealed(self._chart, self._watch.check)), GUESSES):
+        for labels in islice(self._labels_near(guess), GUESSES):
             if self._known and len(set(labels)) >= len(set(self._known)):
                 break
             naming = _Naming(list(labels), self._street_control(labels))
@@ -144,11 +211,12 @@ class FramedEngine(SameEngine):
                     if tuple(labels) in known:
                         continue
                     naming = _Naming(labels, self._street_control(labels))
-                    if next(self._streets(naming, "ignore"), None) is None:
+                    known.add(tuple(labels))
+                    if next(self._streets(naming, "ignore"), None) is not None:
+                        yield naming
+                    elif not self._named_at(dstates):
                         refused = labels
                         break
-                    known.add(tuple(labels))
-                    yield naming
             if refused is None:
                 return
             self._forbid(refused)
@@ -237,7 +305,6 @@ class FramedEngine(SameEngine):
 
     def _begin(self, chart: FramedChart) -> None:
         super()._begin(chart)
-        self._guessed = False
         self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # parts of sides.lp
 
     def _give(self, chart: FramedChart, order: Sequence[int], fits: frozenset[Pair]) -> None:

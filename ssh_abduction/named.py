@@ -40,7 +40,7 @@ from ssh_abduction.apart import apart_from, clique
 from ssh_abduction.chart import Chart, NoFrame
 from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Stopped, Watch
 from ssh_abduction.merging import merged
-from ssh_abduction.nearby import AT_A_TIME, Beside, NearbyEngine
+from ssh_abduction.nearby import AT_A_TIME, Beside, NearbyEngine, mended, numbered
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
@@ -197,7 +197,7 @@ class NamedEngine(ChartedEngine):
 
         def guessed() -> list[int]:
             labels = annealed(chart, watch.check, rough=True).labels(chart)
-            return [labels[node] for node in chart.node_of]
+            return mended([labels[node] for node in chart.node_of], self._chart)
 
         if beside:
             self._beside = Beside(engine, watch, guessed)
@@ -227,14 +227,6 @@ class NamedEngine(ChartedEngine):
     def _heed(self, labels: list[int] | None, bound: int) -> None:
         """Take what the search near a guess knows."""
         self._known, self.bound = labels, max(self.bound or 0, bound)
-
-    def _has_processors(self) -> bool:
-        """Whether a search may have two threads."""
-        if not self._speedups.threads:
-            return False
-        from joblib import cpu_count  # takes its time to load
-
-        return bool(cpu_count() > 1)
 
     def _ask_one_by_one(self) -> None:
         self._one_by_one = True
@@ -289,8 +281,8 @@ class NamedEngine(ChartedEngine):
         if known:
             yield known
         if not known or enough != 1:
-            first = _numbered(known or ())
-            yield from (labels for labels in self._listed(dstates, enough) if _numbered(labels) != first)
+            first = numbered(known or ())
+            yield from (labels for labels in self._listed(dstates, enough) if numbered(labels) != first)
 
     def _listed(self, dstates: int, enough: int) -> Iterator[list[int]]:
         """The same, as clingo lists them."""
@@ -449,9 +441,3 @@ class NamedEngine(ChartedEngine):
             link, trail = trail
             if link not in self._links:
                 yield link, None
-
-
-def _numbered(labels: Sequence[int]) -> list[int]:
-    """Labels, numbered by their first step."""
-    number: dict[int, int] = {}
-    return [number.setdefault(label, len(number)) for label in labels]

@@ -19,8 +19,9 @@ from __future__ import annotations
 
 import random
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from itertools import pairwise
 from typing import Literal, TypeAlias
 
@@ -43,7 +44,7 @@ FIRST_REGION = 10  # dstates of such a part, at first
 AT_A_TIME = 500  # links that clingo is given in one go
 
 Labels: TypeAlias = list[int]
-_Guessed: TypeAlias = tuple[int, int] | None  # what is seen at a step, and its label
+_Key: TypeAlias = tuple[int, int]  # what is seen at a node, and its label
 _Verdict: TypeAlias = Literal["moved", "needed", "open"]
 
 
@@ -84,13 +85,11 @@ class NearbyEngine(ChartedEngine):
         guess  a label of each step; -1 where it is not known. Need not be a map
         tries  how often to ask with more conflicts, before it is left open whether there are fewer. None: until all is settled
         """
-        seen = self._chart.seen
-        actions = [action for _, action, _ in self._chart.links]
-        guessed = followed([None if label < 0 else (view, label) for view, label in zip(seen, guess, strict=True)], seen, actions)
+        guessed = _keys(guess, self._chart)
         name_of = {guessed[node]: name for name, node in reversed(list(enumerate(self.clique)))}
         extra = dict.fromkeys(key for key in guessed if key is not None and key not in name_of)  # of no step of the clique
         counts = Counter(view for view, _ in extra)
-        self._take({view: counts[view] for view in dict.fromkeys(seen)})
+        self._take({view: counts[view] for view in dict.fromkeys(self._chart.seen)})
         left = {view: iter(spare) for view, spare in self._spare.items()}
         name_of |= {key: next(left[key[0]]) for key in extra}
         self._labels = [-1 if key is None else name_of[key] for key in guessed]
@@ -112,6 +111,21 @@ class NearbyEngine(ChartedEngine):
                 if self._allowed is None:
                     yield from self._redrawn(CONFLICTS)
                 conflicts, failed = 2 * conflicts, failed + 1
+
+    def listed(self, watch: Watch) -> Iterator[list[int]]:
+        """All labels with as few dstates as `bound`, once that is known; the same ones now and then once more."""
+        self._watch = watch
+        assert self.bound is not None
+        spares = self.bound - len(self.clique)
+        while True:
+            with closing(self._answers(facts.read_names, f"enum,{spares},{spares}", 0, assumptions=[self._ordered])) as answers:
+                for answer in answers:
+                    if resting := self._rests.intersection(answer.values()):
+                        break
+                    yield numbered(answer[node] for node in range(len(answer)))
+                else:
+                    return
+            self._name_more(resting)
 
     def _take(self, counts: Mapping[int, int]) -> None:
         """Take a control with so many spare names for each view, one more, and a rest."""
@@ -251,14 +265,25 @@ class NearbyEngine(ChartedEngine):
                 if verdict == "moved" or (verdict == "open" and not names):
                     return verdict
             self._allowed, self._waiting = [], [*more, *(spare[-1] for spare in self._spare.values())]
+        at_once = 1  # names that are allowed in one go
         left: list[int] | None = None
         while self._waiting and left != self._waiting:
             left, self._waiting = self._waiting, []
-            for name in left:
-                verdict = yield from self._asked((*self._allowed, name), conflicts)
+            queue = deque(left)
+            doubling = True
+            while queue:
+                added = [queue.popleft() for _ in range(min(at_once, len(queue)))]
+                verdict = yield from self._asked((*self._allowed, *added), conflicts)
                 if verdict == "moved":
                     return verdict
-                (self._allowed if verdict == "needed" else self._waiting).append(name)
+                if verdict == "needed":
+                    self._allowed += added
+                    at_once *= 1 + doubling
+                elif len(added) == 1:
+                    self._waiting += added
+                else:
+                    queue.extendleft(reversed(added))
+                    at_once, doubling = len(added) // 2, False
         return "open" if self._waiting else "needed"
 
     def _asked(self, allowed: Collection[int], conflicts: int) -> Generator[Labels, None, _Verdict]:
@@ -290,22 +315,32 @@ class NearbyEngine(ChartedEngine):
         self._label([renamed.get(name, name) for name in self._labels])
 
 
-def followed(guess: Sequence[_Guessed], seen: Sequence[int], actions: Sequence[int]) -> list[_Guessed]:
-    """A guess in which steps are where most like actions led, as far as what is seen there agrees.
+def mended(guess: Sequence[int], chart: Chart) -> list[int]:
+    """A guess at the labels of all steps, -1 where it is not known, in which they are where most like actions led, if what is seen there agrees.
 
     Where few steps are guessed wrong, that mends them: from a right one on, all that follow are.
     """
-    leads: dict[tuple[_Guessed, int], Counter[_Guessed]] = {}
-    for here, action, there in zip(guess, actions, guess[1:], strict=False):
-        if here is not None and there is not None:
+    keys = _keys(guess, chart)
+    leads: dict[tuple[_Key, int], Counter[_Key]] = {}
+    for t, action, u in chart.links:
+        if (here := keys[t]) is not None and (there := keys[u]) is not None:
             leads.setdefault((here, action), Counter())[there] += 1
-    most = {key: there.most_common(1)[0][0] for key, there in leads.items()}
-    found = list(guess)
-    for t, action in enumerate(actions):
-        there = most.get((found[t], action))
-        if there is not None and there[0] == seen[t + 1]:
-            found[t + 1] = there
-    return found
+    most = {key: counts.most_common(1)[0][0] for key, counts in leads.items()}
+    for t, action, u in chart.links:
+        if (here := keys[t]) is not None and (likely := most.get((here, action))) is not None and likely[0] == chart.seen[u]:
+            keys[u] = likely
+    return [-1 if key is None else key[1] for key in keys]
+
+
+def _keys(guess: Sequence[int], chart: Chart) -> list[_Key | None]:
+    """What is seen at each node, and its label, where it has one: steps that show different things are not at one dstate."""
+    return [None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)]
+
+
+def numbered(labels: Iterable[int]) -> list[int]:
+    """Labels, numbered by the first step at each."""
+    number: dict[int, int] = {}
+    return [number.setdefault(label, len(number)) for label in labels]
 
 
 class Beside:

@@ -39,11 +39,9 @@ from ssh_abduction.trace import Trace
 
 SECONDS_A_PAIR = 3e-5  # what clingo takes, about, to ground two visits that may be one: it cannot be stopped meanwhile
 AT_A_TIME = 20_000  # threes of visits that clingo is told of in one go
-MANY_CONFLICTS = 20_000  # or the conflicts of one call
 TRIES = 100  # conflicts after which it is left open whether a core can be smaller
 FAILED_TRIES = 20  # tries after which a core is kept as it is
 GROWN = 1.1  # how many times as many nodes as at first a control may have, before a new one is taken with a better order
-PATIENCE = 5.0  # seconds that clingo takes for the fewest dstates, after which some map is guessed first
 MANY = 5  # answers found one by one, after which they are looked for nearby
 FAR = 200  # failures to be transitive after which an answer is not nearby
 
@@ -53,7 +51,7 @@ _Turned: TypeAlias = dict[int, dict[int, int]]  # of visits that are the same: w
 
 
 class TakesLong(Exception):  # noqa: N818 - not an error
-    """Clingo has not found the fewest dstates yet, and a map may be found sooner."""
+    """Clingo has not found the fewest dstates yet, and something else is to be done first."""
 
 
 class SameEngine(ChartedEngine):
@@ -147,13 +145,13 @@ class SameEngine(ChartedEngine):
     def _raise_bound(self) -> None:
         self.bound = max(self.bound or 0, self._least)
 
-    def _minimal_labels(self, patient: bool = True) -> list[int] | None:
-        """Dstates of all nodes, as few as can be; None where clingo was told more than any can satisfy. Raises TakesLong if not patient."""
+    def _minimal_labels(self, until: Callable[[], bool] = lambda: False) -> list[int] | None:
+        """Dstates of all nodes, as few as can be; None where clingo was told more than any can satisfy. Raises TakesLong where `until` holds."""
         while not self._found:
-            if self._known and self._least == len(set(self._known)):
+            if self._known and self.bound == len(set(self._known)):
                 self._found.append(self._known)
                 break
-            pairs = self._fewest(patient)
+            pairs = self._fewest(until)
             if pairs is None:
                 return None
             if threes := self._intransitive(pairs):
@@ -162,7 +160,7 @@ class SameEngine(ChartedEngine):
                 self._found.append(self._labels(pairs))
         return list(self._found[0])
 
-    def _fewest(self, patient: bool) -> list[Pair] | None:
+    def _fewest(self, until: Callable[[], bool]) -> list[Pair] | None:
         """An answer with the fewest lone nodes."""
         if not self._speedups.core_guided:
             better = list(self._answers(lambda model: (self._pairs(model), model.cost[0]), "opt", 0))
@@ -172,11 +170,11 @@ class SameEngine(ChartedEngine):
             self._raise_bound()
             return pairs
         while True:
-            if not patient and self.ground_seconds + self.solve_seconds > PATIENCE:
+            if until():
                 raise TakesLong
-            answer, core = self._verdict(self._pairs, list(self._avoided), -1 if patient else MANY_CONFLICTS)
+            answer, core = self._verdict(self._pairs, list(self._avoided), until=until)
             if core is None:
-                if answer is None:  # the conflicts were too many
+                if answer is None:
                     raise TakesLong
                 return answer
             if not core:
@@ -302,7 +300,8 @@ class SameEngine(ChartedEngine):
 
         excluded = set(self._found[self._excluded :])
         self._transitive.asked, self._transitive.failed = True, 0
-        answers = self._answers(read, self._mode(dstates), 0, assumptions=list(self._avoided), until=lambda: self._transitive.failed > FAR)
+        mode, assumed = self._asking_for(dstates)
+        answers = self._answers(read, mode, 0, assumptions=assumed, until=lambda: self._transitive.failed > FAR)
         try:
             while True:
                 try:
@@ -319,15 +318,19 @@ class SameEngine(ChartedEngine):
     def _other(self, dstates: int) -> tuple[int, ...] | None:
         """An answer of so many dstates that was not excluded."""
         while True:
-            pairs, _ = self._verdict(self._pairs, list(self._avoided), mode=self._mode(dstates))
+            mode, assumed = self._asking_for(dstates)
+            pairs, _ = self._verdict(self._pairs, assumed, mode=mode)
             if pairs is None:
                 return None
             if not (threes := self._intransitive(pairs)):
                 return self._labels(pairs)
             self._close(threes)
 
-    def _mode(self, dstates: int) -> str:
-        return "ignore" if self._speedups.core_guided else f"enum,{dstates}"
+    def _asking_for(self, dstates: int) -> tuple[str, list[int]]:
+        """How clingo is asked for so many dstates, at most, and what is assumed."""
+        if self._speedups.core_guided and self._least == dstates:
+            return "ignore", list(self._avoided)
+        return f"enum,{dstates}", []
 
     def _refuse(self, labels: Sequence[int]) -> None:
         """Take back labels that turned out to be no answer."""

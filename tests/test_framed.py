@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from unittest.mock import patch
 
 import clingo
@@ -31,8 +31,9 @@ from ssh_abduction import (
 from ssh_abduction.annealing import annealed
 from ssh_abduction.chart import QUARTERS, Chart, FramedChart, NoFrame
 from ssh_abduction.checker import check
-from ssh_abduction.engine import Stopped
+from ssh_abduction.engine import Stopped, Watch
 from ssh_abduction.framed import FramedEngine
+from ssh_abduction.nearby import Beside, NearbyEngine
 from ssh_abduction.proof import check_bound
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import SPEEDUPS
@@ -76,6 +77,19 @@ def framed_theories(draw: st.DrawFn) -> Theory:
     )
 
 
+class Before(Beside):
+    """A search that comes to its end before the other one goes on."""
+
+    def __init__(self, engine: NearbyEngine, watch: Watch, guess: Callable[[], Sequence[int]]) -> None:
+        super().__init__(engine, watch, guess)
+        self._thread.join()
+
+
+def always_named_at(engine: FramedEngine, dstates: int) -> NearbyEngine | None:
+    """The search beside, also where the other one has come to its end, as it soon does on a short trace."""
+    return engine._named if engine._named and engine._named.bound == dstates else None
+
+
 def plainly_charted(engine: FramedEngine, size: int) -> FramedChart:
     """Without what the trace alone says of order and sides, so that it has to be found."""
     return Chart.framed(engine._trace, engine._log, size)
@@ -90,7 +104,6 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
     cores = {
         "AT_A_TIME": data.draw(st.sampled_from([1, same.AT_A_TIME]), label="at a time"),
         "MANY": data.draw(st.sampled_from([1, 2, same.MANY]), label="many"),
-        "PATIENCE": data.draw(st.sampled_from([-1.0, same.PATIENCE]), label="patience"),
         "FAR": data.draw(st.sampled_from([0, same.FAR]), label="far"),
         "TRIES": data.draw(st.sampled_from([0, same.TRIES]), label="tries"),
         "FAILED_TRIES": data.draw(st.sampled_from([1, same.FAILED_TRIES]), label="failed tries"),
@@ -100,7 +113,10 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         "CLASHES": data.draw(st.sampled_from([1, framed.CLASHES]), label="clashes"),
         "MANY_PAIRS": data.draw(st.sampled_from([5, framed.MANY_PAIRS]), label="many pairs"),
         "GUESSES": data.draw(st.sampled_from([1, framed.GUESSES]), label="guesses"),
+        "PATIENCE": data.draw(st.sampled_from([-1.0, framed.PATIENCE]), label="patience"),
+        "SOON": data.draw(st.sampled_from([-1.0, framed.SOON]), label="soon"),
     }
+    processors = data.draw(st.booleans(), label="processors")
     off -= {"names"}
     charted = data.draw(st.sampled_from([FramedEngine._charted, plainly_charted]), label="charted")
     prefixes = patch.object(engine, "FIRST_PREFIXES", first)
@@ -111,6 +127,7 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         patch.multiple(framed, **streets),
         patch.multiple(annealing, ANNEALED=((0.5, data.draw(st.integers(1, 20), label="sweeps")),), LAST=2, SECONDS=0.0),
         patch.object(FramedEngine, "_charted", charted),
+        patch.object(FramedEngine, "_has_processors", lambda _: processors),
     ):
         search = Search(trace, theory, maps=0, speedups=Speedups.without(off))
         maps = tuple(search)
@@ -125,6 +142,46 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         assert [getattr(found.cost, name) for name in theory.prefer] == [getattr(expected.cost, name) for name in theory.prefer]
     for ssh_map in maps[:3]:
         assert check(trace, ssh_map, theory) == ()
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(framed_traces(), framed_theories(), st.integers(0, 20))
+def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: Theory, sweeps: int) -> None:
+    """From a guess of any quality. Names that do not fit a frame, or have no streets, are no maps; and clingo may need more names than it had."""
+    expected = solve(trace, theory, maps=0, speedups=PLAIN)
+    with (
+        patch.object(solver, "FEW_STEPS", 0),
+        patch.multiple(framed, SOON=-1.0, Beside=Before),
+        patch.multiple(annealing, ANNEALED=((0.5, sweeps),), LAST=2, SECONDS=0.0),
+        patch.object(FramedEngine, "_has_processors", lambda _: True),
+        patch.object(FramedEngine, "_named_at", always_named_at),
+        patch.object(FramedEngine, "_charted", plainly_charted),
+    ):
+        search = Search(trace, theory, maps=0)
+        maps = tuple(search)
+    found = search.solution(maps)
+    assert found.status is expected.status
+    assert found.cost == expected.cost
+    assert set(maps) == set(expected.maps)
+    assert len(set(maps)) == len(maps)
+    assert found.complete
+
+
+@pytest.mark.parametrize(("side", "steps", "seed"), [(4, 120, 3), (4, 120, 7), (5, 200, 4), (5, 400, 5)])
+def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, seed: int) -> None:
+    """There are 2 to 42 in these mazes, most of which have no streets."""
+    walk = maze(side, side, steps=steps, seed=seed, stars=True)
+    expected = solve(walk.trace, Theory.topological(), maps=0, speedups=Speedups.without("annealed"))
+    with (
+        patch.multiple(framed, SOON=-1.0, Beside=Before),
+        patch.object(FramedEngine, "_has_processors", lambda _: True),
+        patch.object(FramedEngine, "_named_at", always_named_at),
+    ):
+        found = solve(walk.trace, Theory.topological(), maps=0)
+    assert found.status is Status.OPTIMAL
+    assert found.bound == expected.bound
+    assert set(found.maps) == set(expected.maps)
+    assert found.count == len(set(found.maps))
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -457,12 +514,16 @@ def test_a_guess_leaves_a_small_map_when_time_is_over() -> None:
     walk = maze(5, 5, steps=1600, seed=1, stars=True)
     asked = FramedEngine._minimal_labels
 
-    def interrupted(self: FramedEngine, patient: bool = True) -> list[int] | None:
-        if patient:
+    def interrupted(self: FramedEngine, until: Callable[[], bool] = lambda: False) -> list[int] | None:
+        if self._guessed:
             raise KeyboardInterrupt
-        return asked(self, patient)
+        return asked(self, until)
 
-    with patch.object(same, "PATIENCE", -1.0), patch.object(FramedEngine, "_minimal_labels", interrupted):
+    with (
+        patch.object(framed, "PATIENCE", -1.0),
+        patch.object(FramedEngine, "_has_processors", lambda _: False),
+        patch.object(FramedEngine, "_minimal_labels", interrupted),
+    ):
         solution = solve(walk.trace, Theory.topological())
     assert solution.status is Status.FEASIBLE
     assert solution.cost
