@@ -23,7 +23,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from itertools import pairwise
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import clingo
 import numpy as np
@@ -141,6 +141,8 @@ class NearbyEngine(ChartedEngine):
         links = self._chart.links
         base = facts.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
         self._control = self._new_control("names", base, ["--eq=1"])
+        configuration: Any = self._control.configuration
+        configuration.configuration, configuration.sat_prepro = "tweety", "no"
         self._used = {name: self._literal(facts.used(name)) for spare in self._spare.values() for name in spare}
         given: set[int] = set()
         last: dict[int, int] = {}  # by view, the last step that has a choice
