@@ -9,6 +9,11 @@ a lower bound, and if some answer of that cost has streets, all minimal maps are
 *If none has*, streets.lp is asked which street shows it, and sides.lp says for that street what order and sides demand of the visits
 that are one. If no single street does, or visits are too many for that, streets.lp is asked which labels clash: smallest sets of nodes at
 dstates that no streets fit; same.lp is told that these do not go together. As every map of the full theory keeps that, bounds still hold.
+
+*Beside.* What takes long is guessed in another thread (`annealing.py`). Near the guess, maps are made here, while there it is proven with
+names, from the guess outwards, how many dstates the causal axioms need (`nearby.py`). Where a map has so few, it has the fewest; and the same
+names then list all ways to be at so few. Some of them fit no frame, which streets.lp sees, or have no streets; but each map of the full
+theory is among them.
 """
 
 from __future__ import annotations
@@ -124,11 +129,10 @@ class FramedEngine(SameEngine):
             return self._known is not None and self.bound == len(set(self._known))
         if not self._speedups.annealed or len(self._fits) > GUESSABLE:
             return False
-        if not self._has_processors():
-            return self._watch.elapsed() > PATIENCE
-        if not self._beside and self._watch.elapsed() > SOON:
+        waited = self._watch.elapsed()
+        if not self._beside and waited > SOON and self._has_processors():
             self._search_beside()
-        return self._guess is not None
+        return self._guess is not None or (not self._beside and waited > PATIENCE)
 
     def _search_beside(self) -> None:
         """Begin to guess in another thread, and to prove from there that the causal axioms need so many dstates."""

@@ -12,7 +12,11 @@ asked for a map of fewer dstates in all.
 *Claim.* If there is none when everything is allowed, the known map is minimal.
 *Proof.* What is asked then is what `named.py` asks, at a cost of one less: by the claim there, each map of so few dstates is an answer. ∎
 
-To allow everything at once is to ask for a proof that may take hours; what clingo learns from each question makes the next one short.
+To allow everything at once is to ask for a proof that may take hours; what clingo learns from each question makes the next one short. So names
+are allowed one, two, four at a time, as long as that goes well.
+
+The nodes need not be the steps of a trace: where places have frames, they are those of `Chart.framed`, and rotations are links as actions are.
+What is found then need not fit a frame, as names.lp does not know how rotations compose; but the bound holds.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ class Speedups:
     annealed     with names or frames: where clingo takes its time, a map near a guess, so that a small one is known
     watched      with names or frames: make constraints of three literals longer, so that clasp watches two of them rather than all three
     one_by_one   with names: where that stalls, ask for numbers of dstates one by one
-    threads      with names: two threads of clasp, where a trace is hard and there are two processors
+    threads      with names or frames: two threads, where a trace is hard and there are two processors
     greedy       some map without a search, for a time limit that leaves no other; in the causal theory a small one where clingo takes its time
     """
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from unittest.mock import patch
 
@@ -165,6 +166,23 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: The
     assert set(maps) == set(expected.maps)
     assert len(set(maps)) == len(maps)
     assert found.complete
+
+
+@pytest.mark.parametrize("limit", [0.5, 3])
+def test_a_limit_ends_the_search_beside(limit: float) -> None:
+    """While it guesses, or while it asks clingo. What is left is a map, and a bound."""
+    trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(400)
+    before = set(threading.enumerate())
+    with patch.object(framed, "SOON", 0.0), patch.object(FramedEngine, "_has_processors", lambda _: True):
+        search = Search(trace, Theory.topological(), limit=limit)
+        maps = tuple(search)
+    solution = search.solution(maps)
+    assert set(threading.enumerate()) <= before
+    assert solution.status is Status.FEASIBLE
+    assert solution.cost
+    assert solution.bound.dstates
+    assert 1 < solution.bound.dstates <= 114 < solution.cost.dstates
+    assert check(trace, solution.maps[0], Theory.topological()) == ()
 
 
 @pytest.mark.parametrize(("side", "steps", "seed"), [(4, 120, 3), (4, 120, 7), (5, 200, 4), (5, 400, 5)])
