@@ -42,7 +42,7 @@ MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much 
 # clasp's way to list answers in which no atom that is shown can be spared:
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 KEPT = 10  # controls of minimal namings that are kept until their maps are listed: each is some megabytes
-SOON = 1.0  # seconds without the fewest dstates after which a map near a guess is sought beside
+SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside
 PATIENCE = 5.0  # the same, where that has to be done first
 GUESSABLE = 1_000_000  # visits that may be one, above which annealing takes too much memory
 GUESSES = 20  # labels that are tried, near what annealing guesses
