@@ -193,6 +193,7 @@ class NamedEngine(ChartedEngine):
             clique=self.clique,
             may_be=self._may_be,
             far=self._far,
+            configuration="tweety",
         )
 
         def guessed() -> list[int]:

@@ -70,12 +70,14 @@ class NearbyEngine(ChartedEngine):
         clique: Sequence[int],
         may_be: Sequence[Sequence[int]],
         far: Matrix | None,
+        configuration: str | None = None,
     ) -> None:
         super().__init__(trace, theory, watch, log, speedups)
         self._chart = chart
         self.clique = list(clique)
         self._may_be = may_be
         self._far = far
+        self._configuration = configuration  # of clasp, if not its default
         self._labels: Labels = []
         self._needed: set[int] = set()  # names that cannot be spared
         self._allowed: list[int] | None = None  # names that do not help, though all are allowed; None before they were tried one by one
@@ -145,8 +147,9 @@ class NearbyEngine(ChartedEngine):
         links = self._chart.links
         base = facts.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
         self._control = self._new_control("names", base, ["--eq=1"])
-        configuration: Any = self._control.configuration
-        configuration.configuration, configuration.sat_prepro = "tweety", "no"
+        if self._configuration:
+            configuration: Any = self._control.configuration
+            configuration.configuration, configuration.sat_prepro = self._configuration, "no"
         self._used = {name: self._literal(facts.used(name)) for spare in self._spare.values() for name in spare}
         given: set[int] = set()
         last: dict[int, int] = {}  # by view, the last step that has a choice

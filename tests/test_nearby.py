@@ -33,7 +33,18 @@ def nearby_engine(trace: Trace) -> NearbyEngine:
     far = far_apart(apart.copy(), log.seen, log.actions)
     watch = Watch(None, None, lambda: None)
     watch.start()
-    return NearbyEngine(trace, CAUSAL, watch, log, Speedups(), chart=Chart.of_steps(log, len(trace)), clique=pinned, may_be=may_be, far=far)
+    return NearbyEngine(
+        trace,
+        CAUSAL,
+        watch,
+        log,
+        Speedups(),
+        chart=Chart.of_steps(log, len(trace)),
+        clique=pinned,
+        may_be=may_be,
+        far=far,
+        configuration="tweety",
+    )
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
