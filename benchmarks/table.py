@@ -116,7 +116,7 @@ def _memory(cells: Cells) -> str:
 
 def _mark(cells: Cells, reasons: list[str]) -> str:
     """The mark of a note that says why there is no answer; the note is added where it is new."""
-    reason = next((cell["reason"] for cell in cells if cell.get("reason")), "")
+    reason = next((cell["reason"] for cell in cells if cell.get("reason")), "").removesuffix(": ")  # an error may say nothing
     if reason and reason not in reasons:
         reasons.append(reason)
     return MARKS[reasons.index(reason) % len(MARKS)] if reason else ""

@@ -146,7 +146,7 @@ class FramedEngine(SameEngine):
             self._speedups,
             chart=chart,
             clique=pinned,
-            may_be=[[pinned.index(node)] if node in pinned else (~row).nonzero()[0].tolist() for node, row in enumerate(apart[:, pinned])],
+            may_be=[(~row).nonzero()[0].tolist() for row in apart[:, pinned]],
             far=None,
         )
 

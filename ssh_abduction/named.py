@@ -94,9 +94,8 @@ class NamedEngine(ChartedEngine):
         apart = self._chart.apart(AT_ONCE)
         self._watch.check()
         self.clique = clique(apart, seen[:AT_ONCE]) if self._speedups.clique else [0]
-        pinned = {node: name for name, node in enumerate(self.clique)}
         columns = apart[:, self.clique] if len(seen) <= AT_ONCE else self._columns(self.clique)
-        self._may_be = [[pinned[t]] if t in pinned else (~row).nonzero()[0].tolist() for t, row in enumerate(columns)]
+        self._may_be = [(~row).nonzero()[0].tolist() for row in columns]
         self._far = self._chart.far_apart(apart) if self._speedups.apart and len(seen) <= AT_ONCE else None
         self._one_by_one = self._hard = False
         self._known = None

@@ -300,12 +300,11 @@ class NearbyEngine(ChartedEngine):
         answer, core = self._with_fewer([self._ordered, *self._not_allowed(allowed)], conflicts)
         if answer is None:
             return "open" if core is None else "needed"
-        resting = {name for name in answer.values() if name in self._rests}
-        if not resting:
+        if resting := self._rests.intersection(answer.values()):
+            self._name_more(resting)
+        else:
             self._keep(answer)
             yield self._labels
-        else:
-            self._name_more(resting)
         return "moved"
 
     def _with_fewer(self, assumed: Sequence[int], conflicts: int) -> tuple[dict[int, int] | None, list[int] | None]:
