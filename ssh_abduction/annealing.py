@@ -139,23 +139,32 @@ class _Drawn:
         rows = self._rows(here, self._visits[:-1])
         back = self._back[there] * self._actions + self._action
         entries = np.concatenate([rows * self._states + there, back * self._states + self._back[rows // self._actions]])
+        self._counted = entries
         shape = self._states * self._actions, self._states
         self._counts = np.bincount(entries, minlength=shape[0] * shape[1]).reshape(shape).astype(np.float32)
         self._totals = self._counts.sum(axis=1)
 
-    def _transitions(self, states: States, power: float) -> NDArray[np.float32]:
-        """visits but the last x states x states of the next: how likely an action leads from one to the other."""
-        rows = self._rows(np.maximum(states[:-1], 0), self._visits[:-1, None])
-        likely: NDArray[np.float32] = self._counts.ravel()[rows[:, :, None] * self._states + np.maximum(states[1:], 0)[:, None, :]]
-        likely += WEIGHT
-        likely /= (self._totals[rows] + np.float32(STATES * WEIGHT))[:, :, None]
-        np.power(likely, np.float32(power), out=likely)
-        likely *= (states[:-1] >= 0)[:, :, None] & (states[1:] >= 0)[:, None, :]
-        return likely
+    def _entries(self, states: States) -> States:
+        """visits but the last x states x states of the next: the entry of the table of transitions. States below 0 are the last one of the table."""
+        rows = self._rows(states[:-1], self._visits[:-1, None])
+        rows[states[:-1] < 0] = self._states * self._actions
+        there = np.where(states[1:] < 0, self._states, states[1:])
+        entries: States = rows[:, :, None] * (self._states + 1) + there[:, None, :]
+        return entries
+
+    def _transitions(self, entries: States, power: float) -> NDArray[np.float32]:
+        """How likely an action leads from one state to the other, for each of these entries."""
+        shape = self._states * self._actions + 1, self._states + 1
+        totals = self._totals + np.float32(STATES * WEIGHT)
+        table = np.zeros(shape, dtype=np.float32)
+        table[:-1, :-1] = np.power(np.float32(WEIGHT) / totals, np.float32(power))[:, None]
+        row, column = np.divmod(self._counted, self._states)
+        table[row, column] = np.power((self._counts[row, column] + np.float32(WEIGHT)) / totals[row], np.float32(power))
+        return table.ravel()[entries]
 
     def choose(self, power: float) -> None:
         """Choose the states that visits are drawn from: at random, the likely ones sooner, and the last one drawn for sure."""
-        likely = self._transitions(self._options, power)
+        likely = self._transitions(self._entries(self._options), power)
         place = (self._options == self._labels[:, None]).argmax(axis=1)
         starts, lengths = self._stretches(0)
         ahead = self._filtered(self._options, likely, place, starts, lengths)
@@ -175,10 +184,11 @@ class _Drawn:
         chosen = np.argpartition(-rank, few - 1, axis=1)[:, :few]
         self._chosen = np.take_along_axis(self._options, chosen, axis=1)
         self._place = (self._chosen == self._labels[:, None]).argmax(axis=1)
+        self._chosen_entries = self._entries(self._chosen)
 
     def sweep(self, power: float) -> None:
         """Draw the states of all visits, stretch by stretch."""
-        likely = self._transitions(self._chosen, power)
+        likely = self._transitions(self._chosen_entries, power)
         starts, lengths = self._stretches(int(self._random.integers(STRETCH)))
         ahead = self._filtered(self._chosen, likely, self._place, starts, lengths)
         place = self._place.copy()
@@ -215,28 +225,25 @@ class _Drawn:
 
 def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
     """The states that each visit may be in."""
-    fits: dict[tuple[int, int], list[int]] = {}  # by two visits: the slots of the second that slot 0 of the first may be
-    apart = np.ones((len(chart.stars), len(chart.stars)), dtype=bool)
-    for i, j, r in chart.fits():
-        fits.setdefault((i, j), []).append(r)
-        fits.setdefault((j, i), []).append(-r % 4)
-        apart[i, j] = apart[j, i] = False
-    np.fill_diagonal(apart, False)
-    pinned = {visit: place for place, visit in enumerate(clique(apart, [0] * len(apart)))}
+    misfits = chart.misfits
     # The star of each visit in a frame whose slot r is slot 0 of the visit, and its kind: the least of them.
     turned = [[tuple(star[(slot - r) % 4] for slot in range(4)) for r in range(4)] for star in chart.stars]
     kinds = [min(stars) for stars in turned]
+    number = {kind: i for i, kind in enumerate(dict.fromkeys(kinds))}
+    apart = np.logical_and.reduce(misfits)
+    pinned = clique(apart, [number[kind] for kind in kinds])
     named = Counter(kinds[visit] for visit in pinned)
     spare: dict[tuple[int, ...], range] = {}
     names = len(pinned)
     for kind, visits in Counter(kinds).items():
         spare[kind] = range(names, names + spares + max(0, visits // visits_each - named[kind]))
         names = spare[kind].stop
-    options: list[list[int]] = []
-    for visit, kind in enumerate(kinds):
-        known = [4 * place + r for other, place in pinned.items() for r in fits.get((visit, other), ())]
-        new = [4 * place + r for place in spare[kind] for r in range(4) if turned[visit][r] == kind]
-        options.append([4 * pinned[visit]] if visit in pinned else known + new)
+    known = ~misfits[:, :, pinned].transpose(1, 2, 0).reshape(len(kinds), -1)  # visits x states of pinned places
+    known[pinned] = False
+    known[pinned, 4 * np.arange(len(pinned))] = True
+    options: list[list[int]] = [np.flatnonzero(row).tolist() for row in known]
+    for visit in set(range(len(kinds))).difference(pinned):
+        options[visit] += [4 * place + r for place in spare[kinds[visit]] for r in range(4) if turned[visit][r] == kinds[visit]]
     padded = np.full((len(options), max(map(len, options))), -1)
     for visit, states in enumerate(options):
         padded[visit, : len(states)] = states

@@ -153,7 +153,7 @@ class FramedChart(Chart):
 
         visits, slots = np.asarray(self.facing[:most]).T
         rotated = (slots[None, :] - slots[:, None]) % 4
-        apart: NDArray[np.bool_] = self._misfits[rotated, visits[:, None], visits[None, :]]
+        apart: NDArray[np.bool_] = self.misfits[rotated, visits[:, None], visits[None, :]]
         apart |= (visits[:, None] == visits[None, :]) & (rotated != 0)
         return apart
 
@@ -171,11 +171,11 @@ class FramedChart(Chart):
         """Visits I < J that may be at one place, and R, where slot 0 of I is then slot R of J."""
         import numpy as np
 
-        turns, first, second = np.nonzero(np.triu(~self._misfits, 1))
+        turns, first, second = np.nonzero(np.triu(~self.misfits, 1))
         return list(zip(first.tolist(), second.tolist(), turns.tolist(), strict=True))
 
     @cached_property
-    def _misfits(self) -> NDArray[np.bool_]:
+    def misfits(self) -> NDArray[np.bool_]:
         """quarters x visits x visits: slot 0 of the first visit cannot be the slot of that number of the second."""
         import numpy as np
 
