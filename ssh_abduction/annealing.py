@@ -35,14 +35,15 @@ from numpy.typing import NDArray
 from ssh_abduction.apart import clique
 from ssh_abduction.chart import FramedChart
 
-SPARES = 6  # spare names for places of a kind, as many more with each attempt, and more where names would have more than so many
+SPARES = 6  # spare names for places of a kind, as many more after two attempts, and more where names would have more than so many
 VISITS = 12  # visits each
 WEIGHT = 0.002  # of the prior: for each of so many states
 STATES = 60  # that an action may lead to
-# An attempt ends where nearly all travels lead where most such travels do. To what power probabilities are taken in the first of so many sweeps:
-ANNEALED = ((0.55, 1500), *4 * ((0.65, 300),))
-FEW = 200  # of so many travels one may lead elsewhere
-ROUGH, ROUGH_VISITS = 5 * ((0.6, 300),), 40  # the same, and how many visits each name has, where a rough guess will do
+# An attempt ends where all travels lead where most such travels do. To what power probabilities are taken in the first of so many sweeps:
+ANNEALED = ((0.5, 1500), *8 * ((0.75, 150),))
+FEW, MOLTEN = 200, 2  # where one of so many leads elsewhere, another attempt is better than to melt the matrix more often than that
+# The same, and how many visits each name has, where a rough guess will do. There one of FEW may lead elsewhere.
+ROUGH, ROUGH_VISITS = ((0.6, 300), *10 * ((0.75, 150),)), 40
 SECONDS = 10.0  # after which there is no other attempt
 COLD = 0.95  # to what power in the last of them
 LAST, QUENCHED = 50, 4.0  # sweeps at the end, so that little is left to chance, and to what power then
@@ -69,17 +70,26 @@ class Guess:
         states, sure = self.states.tolist(), self.sure.tolist()
         return [states[visit] - states[visit] % 4 + (states[visit] + slot) % 4 if sure[visit] else -1 for visit, slot in chart.facing]
 
+    def fits(self, chart: FramedChart) -> bool:
+        """Whether it is a way to be at places: nothing tells visits of one place apart, and each action leads to one dstate."""
+        visits = np.arange(len(self.states))
+        turned = (self.states[:, None] - self.states) % 4
+        places = self.states // 4
+        misfit = chart.misfits[turned, visits[:, None], visits] & (places[:, None] == places) & (visits[:, None] != visits)
+        return not misfit.any() and chart.is_map(self.labels(chart))
+
 
 def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False) -> Guess:
     """A guess at the states of all visits. `check` is called now and then, and may raise.
 
     rough  be content with fewer names, if places were visited often, and with fewer sweeps
     """
-    best: tuple[int, Guess] | None = None
+    few = len(chart.travels) // FEW
+    best, guess = len(chart.travels) + 1, None
     began = time.perf_counter()
     for attempt in count(1):
-        drawn = _Drawn(chart, attempt * SPARES, ROUGH_VISITS if rough else VISITS, np.random.default_rng(attempt))
-        for first, sweeps in ROUGH if rough else ANNEALED:
+        drawn = _Drawn(chart, SPARES * ((attempt + 1) // 2), ROUGH_VISITS if rough else VISITS, np.random.default_rng(attempt))
+        for molten, (first, sweeps) in enumerate(ROUGH if rough else ANNEALED):
             for sweep in range(sweeps + LAST):
                 check()
                 power = first + (COLD - first) * sweep / sweeps if sweep < sweeps else QUENCHED
@@ -87,14 +97,15 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, ro
                     drawn.choose(power)
                 drawn.sweep(power)
             failed = drawn.failed()
-            if best is None or failed < best[0]:
-                best = failed, drawn.guess()
-            if failed <= len(chart.travels) // FEW:
-                return best[1]
-        if time.perf_counter() - began > SECONDS:
-            break
-    assert best is not None
-    return best[1]
+            if failed < best:
+                best, guess = failed, drawn.guess()
+            if guess is not None and (not failed or (rough and failed <= few)):
+                return guess
+            if failed <= few and molten == MOLTEN:
+                break
+        if guess is not None and time.perf_counter() - began > SECONDS:
+            return guess
+    raise AssertionError("unreachable")
 
 
 class _Drawn:

@@ -16,7 +16,7 @@ one node, linked by rotations both ways. Nodes are apart if that follows from wh
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -66,6 +66,16 @@ class Chart:
         from ssh_abduction.apart import far_apart
 
         return far_apart(apart, self.seen, [action for _, action, _ in self.links])
+
+    def is_map(self, labels: Sequence[int]) -> bool:
+        """Whether the labels of all nodes are those of a map: each dstate shows one view, and each action leads to one dstate."""
+        view: dict[int, int] = {}
+        leads: dict[tuple[int, int], int] = {}
+        return (
+            min(labels) >= 0
+            and all(view.setdefault(label, seen) == seen for label, seen in zip(labels, self.seen, strict=True))
+            and all(leads.setdefault((labels[t], action), labels[u]) == labels[u] for t, action, u in self.links)
+        )
 
     @staticmethod
     def turned(trace: Trace, log: Log, size: int) -> FramedChart:
@@ -202,3 +212,9 @@ class FramedChart(Chart):
                     alike = ((leaves[i] + r) % 4 == leaves) & (action == action[i])
                     row[:-1] |= alike[:-1] & misfits[0, i + 1, 1:]
         return misfits
+
+
+def numbered(labels: Iterable[int]) -> list[int]:
+    """Labels, numbered by the first step at each."""
+    number: dict[int, int] = {}
+    return [number.setdefault(label, len(number)) for label in labels]

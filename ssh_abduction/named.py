@@ -37,10 +37,10 @@ from numpy.typing import NDArray
 from ssh_abduction import facts
 from ssh_abduction.annealing import annealed
 from ssh_abduction.apart import apart_from, clique
-from ssh_abduction.chart import Chart, NoFrame
+from ssh_abduction.chart import Chart, NoFrame, numbered
 from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Stopped, Watch
 from ssh_abduction.merging import merged
-from ssh_abduction.nearby import AT_A_TIME, Beside, NearbyEngine, mended, numbered
+from ssh_abduction.nearby import AT_A_TIME, Beside, NearbyEngine, mended
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
@@ -158,7 +158,7 @@ class NamedEngine(ChartedEngine):
                 if not lazy:
                     self._ask_one_by_one()
                     continue
-                if self._speedups.greedy and len(self._chart.seen) <= AT_ONCE:
+                if self._speedups.greedy and len(self._chart.seen) <= AT_ONCE and not self._beside:
                     actions = [action for _, action, _ in self._chart.links]
                     yield merged(self._chart.seen, actions, self.clique, self._watch.check)
                 self._add(self._chart.links)

@@ -34,7 +34,7 @@ import numpy as np
 
 from ssh_abduction import facts
 from ssh_abduction.apart import Matrix
-from ssh_abduction.chart import Chart
+from ssh_abduction.chart import Chart, numbered
 from ssh_abduction.engine import ChartedEngine, Stopped, Watch
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
@@ -91,6 +91,8 @@ class NearbyEngine(ChartedEngine):
         guess  a label of each step; -1 where it is not known. Need not be a map
         tries  how often to ask with more conflicts, before it is left open whether there are fewer. None: until all is settled
         """
+        if self._chart.is_map(guess):
+            yield list(guess)
         guessed = _keys(guess, self._chart)
         name_of = {guessed[node]: name for name, node in reversed(list(enumerate(self.clique)))}
         extra = dict.fromkeys(key for key in guessed if key is not None and key not in name_of)  # of no step of the clique
@@ -343,12 +345,6 @@ def mended(guess: Sequence[int], chart: Chart) -> list[int]:
 def _keys(guess: Sequence[int], chart: Chart) -> list[_Key | None]:
     """What is seen at each node, and its label, where it has one: steps that show different things are not at one dstate."""
     return [None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)]
-
-
-def numbered(labels: Iterable[int]) -> list[int]:
-    """Labels, numbered by the first step at each."""
-    number: dict[int, int] = {}
-    return [number.setdefault(label, len(number)) for label in labels]
 
 
 class Beside:

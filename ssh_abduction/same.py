@@ -32,7 +32,7 @@ import clingo
 from ssh_abduction import facts
 from ssh_abduction.annealing import Guess
 from ssh_abduction.apart import clique
-from ssh_abduction.chart import Chart, FramedChart
+from ssh_abduction.chart import Chart, FramedChart, numbered
 from ssh_abduction.engine import ChartedEngine, Watch
 from ssh_abduction.replay import Log
 from ssh_abduction.trace import Trace
@@ -227,9 +227,12 @@ class SameEngine(ChartedEngine):
     def _labels_near(self, guess: Guess) -> Iterator[tuple[int, ...]]:
         """Labels of all nodes where visits that the guess is sure of, and has at one place, are one; then others, with few dstates.
 
-        First, no others are one where that can be, until these are labels of a map. Then clingo is asked for no lone nodes; of those that a
-        core shows to be too many, one is left alone. Visits of places that cannot all be as guessed are let free.
+        A guess that fits the chart comes first, as it is. Then no others are one where that can be, until these are labels of a map. Then
+        clingo is asked for no lone nodes; of those that a core shows to be too many, one is left alone. Visits of places that cannot
+        all be as guessed are let free.
         """
+        if guess.fits(self._chart):
+            yield tuple(numbered(guess.labels(self._chart)))
         states, sure = guess.states.tolist(), guess.sure.tolist()
         place_of: dict[int, int] = {}  # by the literal that two of its visits are one
         avoided: set[int] = set()
