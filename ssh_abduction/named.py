@@ -22,7 +22,8 @@ there is none, the bound is one higher. The first answer without a rest is a min
 search then goes on with the other maps.
 
 Beside all that, where the trace lets itself be taken for one of places with frames, a map near a guess is sought (`annealing.py`, `nearby.py`), in
-a thread of its own, or where there is but one processor, first and not for long. Whatever bound meets it ends the search.
+a thread of its own, or where there is but one processor, first and not for long. Whatever bound meets it ends the search. Where none is
+sought, steps are merged by evidence (`merging.py`), so that a limit leaves a map that is not bad.
 """
 
 from __future__ import annotations

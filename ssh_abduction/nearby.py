@@ -91,7 +91,7 @@ class NearbyEngine(ChartedEngine):
         guess  a label of each step; -1 where it is not known. Need not be a map
         tries  how often to ask with more conflicts, before it is left open whether there are fewer. None: until all is settled
         """
-        if self._chart.is_map(guess):
+        if known := self._chart.is_map(guess):
             yield list(guess)
         guessed = _keys(guess, self._chart)
         name_of = {guessed[node]: name for name, node in reversed(list(enumerate(self.clique)))}
@@ -101,13 +101,15 @@ class NearbyEngine(ChartedEngine):
         left = {view: iter(spare) for view, spare in self._spare.items()}
         name_of |= {key: next(left[key[0]]) for key in extra}
         self._labels = [-1 if key is None else name_of[key] for key in guessed]
+        # Even where the guess is a map: clasp goes on choosing as in its last answer, and so stays near.
         for allowed in ((), [name for spare in self._spare.values() for name in spare[:-1]]):
             verdict = self._moved(self._not_allowed(allowed), (), WIDE * CONFLICTS, step_by_step=True)
             if verdict == "moved":
                 break
         else:
             return
-        yield self._labels
+        if not known:
+            yield self._labels
         conflicts, failed = CONFLICTS, 0
         while failed != tries:
             yield from self._spared(conflicts)

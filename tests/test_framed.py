@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from unittest.mock import patch
 
 import clingo
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -29,7 +30,7 @@ from ssh_abduction import (
     solve,
     solver,
 )
-from ssh_abduction.annealing import annealed
+from ssh_abduction.annealing import Guess, annealed
 from ssh_abduction.chart import QUARTERS, Chart, FramedChart, NoFrame
 from ssh_abduction.checker import check
 from ssh_abduction.engine import Stopped, Watch
@@ -525,6 +526,36 @@ def test_a_guess_holds_the_stars(trace: Trace, sweeps: int) -> None:
         place, turned = divmod(state, 4)
         framed_star = tuple(star[(slot - turned) % 4] for slot in range(4))
         assert stars.setdefault(place, framed_star) == framed_star
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_guess_fits_where_it_is_the_truth(seed: int) -> None:
+    """And not where any one visit is somewhere else, unless that is a way to be at places, too."""
+    walk = maze(3, 3, steps=120, seed=seed, stars=True)
+    chart = Chart.framed(walk.trace, Log(walk.trace, Theory(star="frame")))
+    stood: dict[int, tuple[object, int]] = {}  # of each visit its cell, and where slot 0 of it faces
+    for node, (x, y, heading) in zip(chart.node_of, walk.truth, strict=True):
+        visit, slot = chart.facing[node]
+        stood[visit] = (x, y), (heading - slot) % 4
+    number = {cell: i for i, cell in enumerate(dict.fromkeys(cell for cell, _ in stood.values()))}
+    states = np.array([4 * number[cell] + faces for cell, faces in stood.values()])
+    sure = np.ones(len(states), dtype=bool)
+    assert Guess(states, sure).fits(chart)
+    refused = 0
+    for visit in range(len(states)):
+        for state in range(4 * len(number)):
+            other = states.copy()
+            other[visit] = state
+            guess = Guess(other, sure)
+            leads: dict[tuple[int, object], set[int]] = {}
+            labels = guess.labels(chart)
+            for t, action in enumerate(walk.trace.actions):
+                leads.setdefault((labels[chart.node_of[t]], action.turn), set()).add(labels[chart.node_of[t + 1]])
+            alike = all(len(there) == 1 for there in leads.values())
+            if guess.fits(chart):
+                assert alike
+            refused += not guess.fits(chart)
+    assert refused > 0.9 * 4 * len(number) * (len(states) - 1)
 
 
 def test_a_guess_leaves_a_small_map_when_time_is_over() -> None:
