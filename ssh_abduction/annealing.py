@@ -27,13 +27,12 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.apart import clique
-from ssh_abduction.chart import FramedChart
+from ssh_abduction.chart import FramedChart, numbered
 
 SPARES = 6  # spare names for places of a kind, as many more after two attempts, and more where names would have more than so many
 VISITS = 12  # visits each
@@ -85,9 +84,11 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, ro
     rough  be content with fewer names, if places were visited often, and with fewer sweeps
     """
     few = len(chart.travels) // FEW
-    best, guess = len(chart.travels) + 1, None
+    found: dict[int, Guess] = {}  # by how many travels lead elsewhere
     began = time.perf_counter()
-    for attempt in count(1):
+    attempt = 0
+    while True:
+        attempt += 1
         drawn = _Drawn(chart, SPARES * ((attempt + 1) // 2), ROUGH_VISITS if rough else VISITS, np.random.default_rng(attempt))
         for molten, (first, sweeps) in enumerate(ROUGH if rough else ANNEALED):
             for sweep in range(sweeps + LAST):
@@ -97,15 +98,13 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, ro
                     drawn.choose(power)
                 drawn.sweep(power)
             failed = drawn.failed()
-            if failed < best:
-                best, guess = failed, drawn.guess()
-            if guess is not None and (not failed or (rough and failed <= few)):
-                return guess
+            found.setdefault(failed, drawn.guess())
+            if failed <= (few if rough else 0):
+                return found[failed]
             if failed <= few and molten == MOLTEN:
                 break
-        if guess is not None and time.perf_counter() - began > SECONDS:
-            return guess
-    raise AssertionError("unreachable")
+        if time.perf_counter() - began > SECONDS:
+            return found[min(found)]
 
 
 class _Drawn:
@@ -240,9 +239,7 @@ def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
     # The star of each visit in a frame whose slot r is slot 0 of the visit, and its kind: the least of them.
     turned = [[tuple(star[(slot - r) % 4] for slot in range(4)) for r in range(4)] for star in chart.stars]
     kinds = [min(stars) for stars in turned]
-    number = {kind: i for i, kind in enumerate(dict.fromkeys(kinds))}
-    apart = np.logical_and.reduce(misfits)
-    pinned = clique(apart, [number[kind] for kind in kinds])
+    pinned = clique(np.logical_and.reduce(misfits), numbered(kinds))
     named = Counter(kinds[visit] for visit in pinned)
     spare: dict[tuple[int, ...], range] = {}
     names = len(pinned)

@@ -16,7 +16,7 @@ one node, linked by rotations both ways. Nodes are apart if that follows from wh
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -214,7 +214,7 @@ class FramedChart(Chart):
         return misfits
 
 
-def numbered(labels: Iterable[int]) -> list[int]:
+def numbered(labels: Iterable[Hashable]) -> list[int]:
     """Labels, numbered by the first step at each."""
-    number: dict[int, int] = {}
+    number: dict[Hashable, int] = {}
     return [number.setdefault(label, len(number)) for label in labels]

@@ -552,9 +552,9 @@ def test_a_guess_fits_where_it_is_the_truth(seed: int) -> None:
             for t, action in enumerate(walk.trace.actions):
                 leads.setdefault((labels[chart.node_of[t]], action.turn), set()).add(labels[chart.node_of[t + 1]])
             alike = all(len(there) == 1 for there in leads.values())
-            if guess.fits(chart):
-                assert alike
-            refused += not guess.fits(chart)
+            fits = guess.fits(chart)
+            assert alike or not fits
+            refused += not fits
     assert refused > 0.9 * 4 * len(number) * (len(states) - 1)
 
 
