@@ -25,8 +25,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import count, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +40,8 @@ VISITS = 12  # visits each
 WEIGHT = 0.002  # of the prior: for each of so many states
 STATES = 60  # that an action may lead to
 # An attempt ends where all travels lead where most such travels do. To what power probabilities are taken in the first of so many sweeps:
-ANNEALED = ((0.5, 1500), *8 * ((0.75, 150),))
-FEW, MOLTEN = 200, 2  # where one of so many leads elsewhere, another attempt is better than to melt the matrix more often than that
+ANNEALED = ((0.5, 1500),)
+FEW = 200
 # The same, and how many visits each name has, where a rough guess will do. There one of FEW may lead elsewhere.
 ROUGH, ROUGH_VISITS = ((0.6, 300), *10 * ((0.75, 150),)), 40
 SECONDS = 10.0  # after which there is no other attempt
@@ -66,8 +67,28 @@ class Guess:
 
     def labels(self, chart: FramedChart) -> list[int]:
         """A number for the dstate of each node of the chart; -1 where the guess is not sure."""
-        states, sure = self.states.tolist(), self.sure.tolist()
-        return [states[visit] - states[visit] % 4 + (states[visit] + slot) % 4 if sure[visit] else -1 for visit, slot in chart.facing]
+        sure = self.sure.tolist()
+        return [label if sure[visit] else -1 for label, (visit, _) in zip(self._all(chart), chart.facing, strict=True)]
+
+    def _all(self, chart: FramedChart) -> list[int]:
+        states = self.states.tolist()
+        return [states[visit] - states[visit] % 4 + (states[visit] + slot) % 4 for visit, slot in chart.facing]
+
+    def loosened(self, chart: FramedChart, travels: int) -> list[int]:
+        """The labels where nothing is known of places at which the same travel leads to several, of those it leads to, or so many travels further."""
+        states, unsure = self.states.tolist(), {visit for visit, sure in enumerate(self.sure.tolist()) if not sure}
+        leads: dict[tuple[int, int, int], set[int]] = {}
+        for visit, (slot, action) in chart.leaves.items():
+            here = states[visit]
+            leads.setdefault((here // 4, (here + slot) % 4, action), set()).add(states[visit + 1])
+        loose = {place for (here, *_), there in leads.items() if len(there) > 1 for place in (here, *(state // 4 for state in there))}
+        joined = [(here // 4, there // 4) for here, there in pairwise(states)]
+        for _ in range(travels):
+            loose |= {place for pair in joined if loose.intersection(pair) for place in pair}
+        return [
+            -1 if states[visit] // 4 in loose or visit in unsure else label
+            for label, (visit, _) in zip(self._all(chart), chart.facing, strict=True)
+        ]
 
     def fits(self, chart: FramedChart) -> bool:
         """Whether it is a way to be at places: nothing tells visits of one place apart, and each action leads to one dstate."""
@@ -83,28 +104,28 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, ro
 
     rough  be content with fewer names, if places were visited often, and with fewer sweeps
     """
-    few = len(chart.travels) // FEW
-    found: dict[int, Guess] = {}  # by how many travels lead elsewhere
+    few = len(chart.travels) // FEW if rough else 0
+    found: dict[int, Guess] = {}
     began = time.perf_counter()
-    attempt = 0
-    while True:
-        attempt += 1
+    for failed, guess in attempts(chart, check, rough=rough):
+        found.setdefault(failed, guess)
+        if failed <= few or time.perf_counter() - began > SECONDS:
+            return found[min(found)]
+    raise AssertionError
+
+
+def attempts(chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False) -> Iterator[tuple[int, Guess]]:
+    """Guesses without end, each with how many travels do not lead where most such travels do. Parameters as above."""
+    for attempt in count(1):
         drawn = _Drawn(chart, SPARES * ((attempt + 1) // 2), ROUGH_VISITS if rough else VISITS, np.random.default_rng(attempt))
-        for molten, (first, sweeps) in enumerate(ROUGH if rough else ANNEALED):
+        for first, sweeps in ROUGH if rough else ANNEALED:
             for sweep in range(sweeps + LAST):
                 check()
                 power = first + (COLD - first) * sweep / sweeps if sweep < sweeps else QUENCHED
                 if sweep % ROUND == 0:
                     drawn.choose(power)
                 drawn.sweep(power)
-            failed = drawn.failed()
-            found.setdefault(failed, drawn.guess())
-            if failed <= (few if rough else 0):
-                return found[failed]
-            if failed <= few and molten == MOLTEN:
-                break
-        if time.perf_counter() - began > SECONDS:
-            return found[min(found)]
+            yield drawn.failed(), drawn.guess()
 
 
 class _Drawn:

@@ -153,18 +153,21 @@ class FramedChart(Chart):
     travels: tuple[tuple[int, int, int], ...]
     elsewhere: Collection[tuple[int, int]] = ()
 
-    def apart(self, most: int) -> NDArray[np.bool_]:
-        """Which pairs of the first nodes are apart: no frame has both visits so turned that the two nodes are one dstate.
+    def apart(self, most: int, others: Sequence[int] | None = None) -> NDArray[np.bool_]:
+        """Which pairs of the first nodes are apart, or which of them and these others: no frame has both visits so turned that the two
+        nodes are one dstate.
 
         As in `apartness`, from the last visit to the first: visits do not fit if they show different things, or if the same action,
         done facing the same way, leads to visits that do not fit as they are.
         """
         import numpy as np
 
-        visits, slots = np.asarray(self.facing[:most]).T
-        rotated = (slots[None, :] - slots[:, None]) % 4
-        apart: NDArray[np.bool_] = self.misfits[rotated, visits[:, None], visits[None, :]]
-        apart |= (visits[:, None] == visits[None, :]) & (rotated != 0)
+        facing = np.asarray(self.facing[:most])
+        visits, slots = facing.T
+        other_visits, other_slots = (facing if others is None else facing[list(others)]).T
+        rotated = (other_slots - slots[:, None]) % 4
+        apart: NDArray[np.bool_] = self.misfits[rotated, visits[:, None], other_visits]
+        apart |= (visits[:, None] == other_visits) & (rotated != 0)
         return apart
 
     @cached_property

@@ -335,9 +335,9 @@ def read_contrary(model: Model) -> tuple[list[int], list[int]]:
     return [dstate for _, dstate in contrary], sorted(args[0] for name, args in atoms if name == "twice")
 
 
-def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int]) -> str:
-    """The dstates of these nodes, what is open from dstates, and what is preferred, as facts for the least streets."""
-    facts = [settled_labels((node, labels[node]) for node in nodes)]
+def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int], *, single: bool = False) -> str:
+    """The dstates of these nodes, what is open from dstates, and what is preferred, as facts for the least streets; or for single ones."""
+    facts = [settled_labels((node, labels[node]) for node in nodes), *(["single."] if single else [])]
     for label, node in {label: node for node, label in enumerate(labels)}.items():  # any node of a dstate sees the same star
         visit, slot = chart.facing[node]
         star = chart.stars[visit]
@@ -346,9 +346,19 @@ def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nod
     return "\n".join(facts)
 
 
-def read_elsewhere(model: Model) -> set[tuple[int, int]]:
-    """Pairs of nodes that are at different places."""
-    return {(x, y) for _, (x, y) in map(_atom, model.symbols(shown=True))}
+def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int, int]]]:
+    """Whether the labels of nodes are violated, and else which pairs of dstates are at different places, and which are one."""
+    found: dict[str, list[tuple[int, int]]] = {"elsewhere": [], "one": []}
+    for name, args in map(_atom, model.symbols(shown=True)):
+        if name == "violated":
+            return True, [], []
+        found[name].append((args[0], args[1]))
+    return False, found["elsewhere"], found["one"]
+
+
+def loose(labels: Iterable[int]) -> str:
+    """Dstates that may turn out to be others, as facts."""
+    return "\n".join(f"loose({label})." for label in labels)
 
 
 def settled_labels(labels: Iterable[tuple[int, int]]) -> str:

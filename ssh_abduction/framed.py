@@ -19,25 +19,30 @@ theory is among them.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import combinations, islice
+from functools import partial
+from itertools import chain, combinations
 
 import clingo
+import numpy as np
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.annealing import Guess, annealed
-from ssh_abduction.chart import Chart, FramedChart, NoFrame
+from ssh_abduction.annealing import SECONDS, attempts
+from ssh_abduction.apart import Matrix
+from ssh_abduction.chart import Chart, FramedChart, NoFrame, numbered
 from ssh_abduction.engine import Found, Watch
-from ssh_abduction.nearby import Beside, NearbyEngine
+from ssh_abduction.merging import Told, merged_near
+from ssh_abduction.nearby import Beside, NearbyEngine, mended
 from ssh_abduction.replay import Log
-from ssh_abduction.same import Pair, SameEngine, TakesLong, smaller
+from ssh_abduction.same import SECONDS_A_PAIR, Pair, SameEngine, TakesLong, smaller
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
 CLASHES = 30  # that clingo is told of in one go
+MANY_DSTATES = 50  # above which it is asked for single streets first
 MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much to say: some forty rules for each of them
 # clasp's way to list answers in which no atom that is shown can be spared:
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
@@ -45,6 +50,7 @@ KEPT = 10  # controls of minimal namings that are kept until their maps are list
 SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside
 PATIENCE = 5.0  # the same, where that has to be done first
 GUESSABLE = 1_000_000  # visits that may be one, above which annealing takes too much memory
+LOOSENED = 2  # so many travels, less one, from where a guess cannot be right its places are let free
 GUESSES = 20  # labels that are tried, near what annealing guesses
 GUESSING = 1000  # conflicts after which better streets of these are no longer sought
 BETTERING = 20_000  # conflicts after which better streets are no longer sought one after another
@@ -66,9 +72,11 @@ class FramedEngine(SameEngine):
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
         super().__init__(trace, theory, watch, log, speedups)
         self.paths = len(trace)  # names for paths are never short
-        self._guess: Guess | None = None
+        self._guess: list[int] | None = None  # labels of a map of the causal axioms
         self._guessed = False  # whether maps near the guess were sought
+        self._known_cost: tuple[int, ...] = ()  # of the known map, until better streets were looked for
         self._beside: Beside | None = None  # a search that begins with the guess
+        self._tried: list[int] | None = None  # labels found there, the last of which it is known whether they have streets
         self._named: NearbyEngine | None = None  # what searches there
         self._street_seconds = 0.0  # what the last control for streets took, which cannot be stopped meanwhile
         self._framed = True  # whether the visits fit their frames
@@ -78,7 +86,7 @@ class FramedEngine(SameEngine):
         if size != self.size:
             self._best = None
             self._end_beside()
-            self._guess, self._guessed, self._named = None, False, None
+            self._guess, self._guessed, self._named, self._tried = None, False, None, None
         try:
             super().grow(size)
         except NoFrame:
@@ -91,24 +99,24 @@ class FramedEngine(SameEngine):
         best: Found | None = None
         labels = yield from self._fewest_dstates()
         while labels is not None:
-            named = _Naming(labels, self._street_control(labels))
-            for best in self._better_streets(named):
-                yield best
+            best, named = self._some_streets(labels)
             if best is not None:
+                yield best
                 break
             self._forbid(labels)
             labels = yield from self._fewest_dstates()
         self._end_beside()
         if best is None or labels is None:
             return
-        namings = [named]
-        for other in self._fitting(best.cost[0], besides=labels):
-            for found in self._better_streets(other):
+        namings: list[_Naming] = []
+        for other in chain([named], self._fitting(best.cost[0], besides=labels)):
+            naming = other if other.control else replace(other, control=self._street_control(other.labels))
+            for found in self._better_streets(naming):
                 if found.cost < best.cost:
                     best, namings = found, []
                     yield best
             if found.cost == best.cost:
-                namings.append(other if len(namings) < KEPT else replace(other, control=None))
+                namings.append(naming if len(namings) < KEPT else replace(naming, control=None))
         self._best = best.cost, namings
 
     def _fewest_dstates(self) -> Generator[Found, None, list[int] | None]:
@@ -119,25 +127,28 @@ class FramedEngine(SameEngine):
             except TakesLong:
                 if not self._guessed:
                     self._guessed = True
-                    yield from self._guesses(self._guess or annealed(self._chart, self._watch.check))
+                    yield from self._guesses(self._guess or self._guessed_labels(self._chart, self._watch.check))
+                else:
+                    yield from self._news_beside()
+                    yield from self._bettered()
 
     def _has_news(self) -> bool:
-        """Whether there is a guess, or it is time for one; or the search beside shows that no map has fewer dstates than the known one."""
+        """Whether there is a guess, or it is time for one; or what the search beside found is to be tried, or shows that the known map has fewest dstates."""
         if self._beside:
             self._heed(self._beside)
         if self._guessed:
-            return self._known is not None and self.bound == len(set(self._known))
+            return self._labels_beside() is not None or (self._known is not None and self.bound == len(set(self._known)))
         if not self._speedups.annealed or len(self._fits) > GUESSABLE:
             return False
         waited = self._watch.elapsed()
         if not self._beside and waited > SOON and self._has_processors():
-            self._search_beside()
+            self._search_beside(self._chart)
         return self._guess is not None or (not self._beside and waited > PATIENCE)
 
-    def _search_beside(self) -> None:
+    def _search_beside(self, chart: FramedChart) -> None:
         """Begin to guess in another thread, and to prove from there that the causal axioms need so many dstates."""
-        watch, chart, pinned = Watch(None, None, lambda: None), self._chart, self.clique or [0]
-        apart = chart.apart(len(chart.seen))
+        watch, pinned = Watch(None, None, lambda: None), self.clique or [0]
+        apart = chart.apart(len(chart.seen), pinned)
         self._named = NearbyEngine(
             self._trace,
             self._theory,
@@ -146,15 +157,57 @@ class FramedEngine(SameEngine):
             self._speedups,
             chart=chart,
             clique=pinned,
-            may_be=[(~row).nonzero()[0].tolist() for row in apart[:, pinned]],
+            may_be=[(~row).nonzero()[0].tolist() for row in apart],
             far=None,
         )
 
         def guessed() -> list[int]:
-            self._guess = annealed(chart, watch.check)
-            return self._guess.labels(chart)
+            self._guess = self._guessed_labels(chart, watch.check)
+            return self._guess
 
         self._beside = Beside(self._named, watch, guessed)
+
+    def _guessed_labels(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
+        """Labels of a map of the causal axioms: one that has streets, as far as single streets tell, or where that is not soon found one of few dstates."""
+        began = time.perf_counter()
+        apart = chart.apart(len(chart.seen))
+        found: list[list[int]] = []
+        for _, guess in attempts(replace(chart, elsewhere=()), check):
+            starts = [
+                mended(guess.labels(chart), chart),
+                guess.labels(chart),
+                *(guess.loosened(chart, travels) for travels in range(LOOSENED)),
+            ]
+            maps = [(merged_near(apart, chart.links, start, check=check), start) for start in starts]
+            ranked = sorted(((labels, start) for labels, start in maps if labels), key=lambda pair: len(set(pair[0])))
+            for _, start in ranked:
+                labels = merged_near(apart, chart.links, start, partial(self._told, chart), check)
+                if labels and self._has_single_streets(chart, labels):
+                    return labels
+            found.append(ranked[0][0])
+            if time.perf_counter() - began > SECONDS:
+                return min(found, key=lambda labels: len(set(labels)))
+        raise AssertionError
+
+    def _has_single_streets(self, chart: FramedChart, labels: Sequence[int]) -> bool:
+        control = self._streets_of(chart)
+        control.add("base", [], facts.settled_facts(self._theory, chart, labels, range(len(labels)), single=True))
+        control.ground([("base", []), ("again", []), ("least", [])])
+        return bool(control.solve().satisfiable)
+
+    def _told(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
+        """Which nodes are apart, and which are one, where these labels hold of all nodes but some; None where that cannot be."""
+        control = self._streets_of(chart)
+        control.add("base", [], f"{facts.settled_labels(enumerate(labels))}\n{facts.loose({labels[node] for node in loose})}")
+        control.ground([("base", []), ("again", []), ("apart", [])])
+        with control.solve(yield_=True) as handle:
+            model = handle.model()
+            assert model
+            violated, elsewhere, one = facts.read_told(model)
+        if violated:
+            return None
+        first = {label: node for node, label in reversed(list(enumerate(labels)))}
+        return _apart(chart, labels, elsewhere), [(first[a], first[b]) for a, b in one]
 
     def _end_beside(self) -> None:
         if self._beside:
@@ -178,21 +231,49 @@ class FramedEngine(SameEngine):
         """What searched beside, if that alone showed that there are no fewer dstates."""
         return self._named if self._named and self._named.bound == dstates > self._least else None
 
-    def _guesses(self, guess: Guess) -> Iterator[Found]:
+    def _guesses(self, guess: Sequence[int]) -> Iterator[Found]:
         """Maps near a guess, if it leads to any, each with fewer dstates than the one before; then better streets for the last."""
-        best: _Naming | None = None
-        for labels in islice(self._labels_near(guess), GUESSES):
-            if self._known and len(set(labels)) >= len(set(self._known)):
+        failed = 0
+        for labels in self._labels_near(guess):
+            yield from self._bettered()
+            if labels is None:
+                yield from self._news_beside()
+            elif self._known and len(set(labels)) >= len(set(self._known)):
                 break
-            naming = _Naming(list(labels), self._street_control(labels))
-            found = next(self._better_streets(naming), None)
-            if found is None:
+            elif not (yield from self._known_if_it_has_streets(labels)):
                 self._forbid(labels)
-            else:
-                self._known, best = labels, naming
-                yield found
-        if best and len(self._theory.priorities) > 1:
-            yield from self._streets(best, "opt", GUESSING)
+                failed += 1
+                if failed == GUESSES:
+                    break
+        yield from self._bettered()
+
+    def _bettered(self) -> Iterator[Found]:
+        """The known map with better streets, unless these were looked for already."""
+        if self._known and self._known_cost and len(self._theory.priorities) > 1:
+            cost, self._known_cost = self._known_cost, ()
+            yield from (found for found in self._streets(_Naming(list(self._known), None), "opt", GUESSING) if found.cost < cost)
+
+    def _news_beside(self) -> Iterator[Found]:
+        """A map of the labels last found beside, if they are new and have streets."""
+        if labels := self._labels_beside():
+            self._tried = labels
+            yield from self._known_if_it_has_streets(labels)
+
+    def _labels_beside(self) -> list[int] | None:
+        """The labels last found beside, if they were not tried yet, and have fewer dstates than the known map."""
+        labels = self._beside.labels if self._beside else None
+        if labels is self._tried or not labels or (self._known and len(set(labels)) >= len(set(self._known))):
+            return None
+        return labels
+
+    def _known_if_it_has_streets(self, labels: Sequence[int]) -> Generator[Found, None, bool]:
+        """The map of these labels, from now on the known one, if any streets fit them. Returns whether they do."""
+        found, _ = self._some_streets(labels)
+        if found is None:
+            return False
+        self._known, self._known_cost = tuple(numbered(labels)), found.cost
+        yield found
+        return True
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         if not self._framed:
@@ -214,9 +295,9 @@ class FramedEngine(SameEngine):
                 for labels in all_labels:
                     if tuple(labels) in known:
                         continue
-                    naming = _Naming(labels, self._street_control(labels))
+                    found, naming = self._some_streets(labels)
                     known.add(tuple(labels))
-                    if next(self._streets(naming, "ignore"), None) is not None:
+                    if found is not None:
                         yield naming
                     elif not self._named_at(dstates):
                         refused = labels
@@ -224,6 +305,20 @@ class FramedEngine(SameEngine):
             if refused is None:
                 return
             self._forbid(refused)
+
+    def _some_streets(self, labels: Sequence[int]) -> tuple[Found | None, _Naming]:
+        """A map with these dstates, if any streets fit them.
+
+        Where dstates are many it is asked first whether there is one in which no two places or stretches are taken for one.
+        """
+        naming = _Naming(list(labels), None)
+        if len(set(labels)) > MANY_DSTATES:
+            single = replace(naming, control=self._street_control(labels, single=True))
+            found = next(self._streets(single, "ignore"), None)
+            if found is not None:
+                return found, naming
+        naming = replace(naming, control=self._street_control(labels))
+        return next(self._streets(naming, "ignore"), None), naming
 
     def _better_streets(self, naming: _Naming) -> Iterator[Found]:
         """Maps with these dstates, each as good as the one before or better, the last one best; none if no streets fit them.
@@ -242,24 +337,29 @@ class FramedEngine(SameEngine):
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
         labels = naming.labels
         control = naming.control or self._street_control(labels)
-        dstates = len(set(labels))
 
         def read(model: clingo.Model) -> Found:
-            return Found(facts.read_streets(model, self._trace, self._chart, labels), (dstates, *model.cost[1:]))
+            found = facts.read_streets(model, self._trace, self._chart, labels)
+            counts = {"dstates": len(found.dstates), "places": len(found.places), "paths": len(found.paths)}
+            return Found(found, tuple(counts[preferred] for preferred in self._theory.priorities))
 
         return (yield from self._answers(read, mode, int(mode == "ignore"), control=control, conflicts=conflicts))
 
-    def _street_control(self, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None) -> clingo.Control:
-        """A control for the streets that fit the labels of all nodes, or of these."""
-        self._watch.check(self._street_seconds)
+    def _street_control(
+        self, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None, *, single: bool = False
+    ) -> clingo.Control:
+        """A control for the streets that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
+        self._watch.check(0.0 if single else self._street_seconds)
         began = time.perf_counter()
         control = self._streets_of(self._chart, options)
         control.load(encodings.path("preference"))
-        control.add("base", [], facts.settled_facts(self._theory, self._chart, labels, range(len(labels)) if nodes is None else nodes))
-        control.ground([("base", []), ("least", [])])
+        nodes = range(len(labels)) if nodes is None else nodes
+        control.add("base", [], facts.settled_facts(self._theory, self._chart, labels, nodes, single=single))
+        control.ground([("base", []), *([("again", [])] if single else []), ("least", [])])
         self._watch.check()
-        self._street_seconds = time.perf_counter() - began
-        self.ground_seconds += self._street_seconds
+        seconds = time.perf_counter() - began
+        self._street_seconds = self._street_seconds if single else seconds
+        self.ground_seconds += seconds
         return control
 
     def _forbid(self, labels: Sequence[int]) -> None:
@@ -307,8 +407,11 @@ class FramedEngine(SameEngine):
         self.ground_seconds += time.perf_counter() - began
         return True
 
-    def _begin(self, chart: FramedChart) -> None:
-        super()._begin(chart)
+    def _begin(self, chart: FramedChart, fits: frozenset[Pair]) -> None:
+        super()._begin(chart, fits)
+        soon = SECONDS_A_PAIR * len(fits) > SOON  # clingo will not have been told of them before
+        if soon and self._speedups.annealed and len(fits) <= GUESSABLE and self._has_processors():
+            self._search_beside(chart)
         self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # parts of sides.lp
 
     def _give(self, chart: FramedChart, order: Sequence[int], fits: frozenset[Pair]) -> None:
@@ -338,10 +441,12 @@ class FramedEngine(SameEngine):
         """The nodes, and which of them are at different places because of what the trace alone says of order and sides."""
         chart = Chart.framed(self._trace, self._log, size)
         control = self._streets_of(chart)
-        control.add("base", [], facts.settled_labels((node, node) for node in range(len(chart.seen))))
+        nodes = range(len(chart.seen))
+        control.add("base", [], f"{facts.settled_labels(zip(nodes, nodes, strict=True))}\n{facts.loose(nodes)}")
         control.ground([("base", []), ("apart", [])])
         self._watch.check()
-        return next((replace(chart, elsewhere=pairs) for pairs in self._answers(facts.read_elsewhere, "ignore", 1, control=control)), chart)
+        _, elsewhere, _ = next(self._answers(facts.read_told, "ignore", 1, control=control))
+        return replace(chart, elsewhere=elsewhere)
 
     def _streets_of(self, chart: FramedChart, options: Sequence[str] = ()) -> clingo.Control:
         """A control with the axioms of places and paths, and what happened."""
@@ -349,3 +454,18 @@ class FramedEngine(SameEngine):
         control.load(encodings.path("streets"))
         control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
         return control
+
+
+def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:
+    """Nodes x nodes: they are of visits some nodes of which have labels that are at different places."""
+    pairs = np.asarray([*elsewhere, (0, 0)][:-1], dtype=int).reshape(-1, 2)
+    different = np.zeros((max(labels) + 1,) * 2, dtype=bool)
+    different[pairs[:, 0], pairs[:, 1]] = different[pairs[:, 1], pairs[:, 0]] = True
+    visits = np.array([visit for visit, _ in chart.facing])
+    order = np.argsort(visits, kind="stable")
+    starts = np.flatnonzero(np.diff(visits[order], prepend=-1))
+    label = np.asarray(labels)[order]
+    rows = np.logical_or.reduceat(different[label], starts, axis=0)
+    apart = np.logical_or.reduceat(rows[:, label], starts, axis=1)
+    nodes: Matrix = apart[np.ix_(visits, visits)]
+    return nodes

@@ -9,13 +9,16 @@ all of it is merged, or nothing, if some two are apart. The more two steps have 
 the *evidence* is how many merges that makes, and how often it confirms one made before. Steps that fit a single known dstate, with much
 evidence, go first; then those with less, or with rivals that have clearly less. A step that fits none is a new dstate.
 
+What is guessed at can be finished in the same way: nodes that a guess has at one dstate are known to begin with, as far as they can be one.
+
 This is evidence-driven state merging (Lang, Pearlmutter, Price 1998, "Results of the Abbadingo One DFA Learning Competition") for one
 trace, from known dstates all over it rather than from a root.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +28,9 @@ from ssh_abduction.apart import Matrix, apartness
 # Least evidence for a merge, and how much it has to be ahead of the next; among how many known dstates at most:
 DEMANDS = ((10, 1), (5, 1), (5, 2), (3, 1), (3, 3), (2, 2), (2, 10), (1, 3), (1, 100), (0, 1), (0, 2), (0, 1000))
 
+Link: TypeAlias = tuple[int, int, int]  # node, action, node
+Told: TypeAlias = tuple[Matrix, Sequence[tuple[int, int]]]  # which nodes are apart, and pairs that are one
+
 
 def merged(seen: Sequence[int], actions: Sequence[int], clique: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
     """The dstate of each step in some map, numbered by first visit.
@@ -33,15 +39,37 @@ def merged(seen: Sequence[int], actions: Sequence[int], clique: Sequence[int], c
     clique         steps that are pairwise apart
     check          called now and then; may raise
     """
-    classes = _Classes(apartness(seen, actions), actions, clique)
-    for evidence, rivals in DEMANDS:
-        while classes.settle(evidence, rivals, check):
-            pass
-    while len(rest := classes.unsettled()):
-        classes.settle_at_any_rate(int(rest[0]))
-        check()
-    number: dict[int, int] = {}
-    return [number.setdefault(root, len(number)) for root in classes.root.tolist()]
+    classes = _Classes(apartness(seen, actions), [(t, action, t + 1) for t, action in enumerate(actions)], clique)
+    classes.settle_all(check)
+    return classes.labels()
+
+
+def merged_near(
+    apart: Matrix,
+    links: Iterable[Link],
+    guess: Sequence[int],
+    tell: Callable[[Sequence[int], Sequence[int]], Told | None] = lambda labels, open_nodes: _NOTHING,
+    check: Callable[[], None] = lambda: None,
+) -> list[int] | None:
+    """The dstate of each node of a chart in some map near a guess, numbered by first node. None where what is told rules that out.
+
+    apart  which nodes are apart, nodes x nodes
+    links  of the chart
+    guess  a label of each node; -1 where it is not known. Nodes that cannot be at one dstate with the others of their label leave it
+    tell   is asked what follows from labels of all nodes, some of which are still open, whenever these have changed; None: they contradict
+    check  called now and then; may raise
+    """
+    first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
+    classes = _Classes(apart.copy(), links, first.values())
+    for node, label in enumerate(guess):
+        if label >= 0:
+            classes.merge(first[label], node)
+    if classes.settle_all(check, lambda: classes.heed(tell(classes.labels(), classes.unsettled().tolist()))):
+        return classes.labels()
+    return None
+
+
+_NOTHING: Told = (np.zeros((0, 0), dtype=bool), ())
 
 
 class _Classes:
@@ -51,15 +79,50 @@ class _Classes:
     known  of each root, whether its class is a dstate of the map
     """
 
-    def __init__(self, apart: Matrix, actions: Sequence[int], clique: Sequence[int]) -> None:
+    def __init__(self, apart: Matrix, links: Iterable[Link], known: Iterable[int]) -> None:
         steps = len(apart)
         self.root = np.arange(steps)
         self.known = np.zeros(steps, dtype=bool)
-        self.known[list(clique)] = True
+        self.known[list(known)] = True
         self._apart = apart  # of each root, the steps that are apart from some step of its class
         self._members: list[NDArray[np.int_]] = [np.array([t]) for t in range(steps)]
-        self._leads: list[dict[int, int]] = [{action: t + 1} for t, action in enumerate(actions)] + [{}]  # of each root, by action
-        self._undo: list[tuple[int, int, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]] = []
+        self._leads: list[dict[int, int]] = [{} for _ in range(steps)]  # of each root, by action
+        for t, action, u in links:
+            self._leads[t][action] = u
+        self._undo: list[tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]] = []
+
+    def labels(self) -> list[int]:
+        """The class of each step, numbered by first step."""
+        number: dict[int, int] = {}
+        return [number.setdefault(root, len(number)) for root in self.root.tolist()]
+
+    def settle_all(self, check: Callable[[], None], agrees: Callable[[], bool] = lambda: True) -> bool:
+        """Make every class a known dstate. Returns whether it agrees with what else is known, whenever some were."""
+        if not agrees():
+            return False
+        for evidence, rivals in DEMANDS:
+            while self.settle(evidence, rivals, check):
+                if not agrees():
+                    return False
+        while len(rest := self.unsettled()):
+            self.settle_at_any_rate(int(rest[0]))
+            check()
+            if not agrees():
+                return False
+        return True
+
+    def heed(self, told: Told | None) -> bool:
+        """Keep what is told of steps apart, and merge those that are one, as far as they can be. Returns whether anything is told."""
+        if told is None:
+            return False
+        apart, one = told
+        if len(apart):
+            self._apart |= apart
+            for root in np.flatnonzero(np.bincount(self.root) > 1):
+                self._apart[root] |= apart[self._members[root]].any(axis=0)
+        for a, b in one:
+            self.merge(a, b, forced=True)
+        return True
 
     def unsettled(self) -> NDArray[np.int_]:
         return np.flatnonzero(~self.known[self.root])
@@ -83,7 +146,7 @@ class _Classes:
             elif ranked[0][0] < evidence + (ranked[1][0] if len(ranked) > 1 else 0):
                 continue
             else:
-                self._merge(ranked[0][1], root)
+                self.merge(ranked[0][1], root)
             settled += 1
         return settled
 
@@ -91,7 +154,7 @@ class _Classes:
         root = int(self.root[step])
         ranked = self._ranked(root, self._fitting(root))
         if ranked:
-            self._merge(ranked[0][1], root)
+            self.merge(ranked[0][1], root)
         else:
             self.known[root] = True
 
@@ -105,14 +168,17 @@ class _Classes:
         """The evidence for each of these dstates that the class can be merged with, most first, and the dstate."""
         found = []
         for dstate in fits:
-            evidence = self._merge(dstate, root)
+            evidence = self.merge(dstate, root)
             if evidence is not None:
                 found.append((evidence, dstate))
                 self._take_back()
         return sorted(found, reverse=True)
 
-    def _merge(self, a: int, b: int) -> int | None:
-        """Merge two classes, and all that has to be merged then. Returns the evidence; None, and nothing is changed, if some are apart."""
+    def merge(self, a: int, b: int, *, forced: bool = False) -> int | None:
+        """Merge two classes, and all that has to be merged then. Returns the evidence; None, and nothing is changed, if some are apart.
+
+        forced  let known dstates turn out to be one
+        """
         self._undo = []
         work = [(a, b)]
         confirmed = 0
@@ -121,13 +187,14 @@ class _Classes:
             if a == b:
                 confirmed += 1
                 continue
-            if (self.known[a] and self.known[b]) or self._apart[a, self._members[b]].any():
+            if (self.known[a] and self.known[b] and not forced) or self._apart[a, self._members[b]].any():
                 self._take_back()
                 return None
             if self.known[b] or (not self.known[a] and len(self._members[a]) < len(self._members[b])):
                 a, b = b, a
             leads, more = self._leads[a], self._leads[b]
-            self._undo.append((a, b, self._apart[a].copy(), leads, self._members[a]))
+            self._undo.append((a, b, bool(self.known[b]), self._apart[a].copy(), leads, self._members[a]))
+            self.known[b] = False
             work += [(leads[action], t) for action, t in more.items() if action in leads]
             self._leads[a] = more | leads
             self._apart[a] |= self._apart[b]
@@ -137,7 +204,7 @@ class _Classes:
 
     def _take_back(self) -> None:
         """Undo the last merge."""
-        for a, b, apart, leads, members in reversed(self._undo):
-            self._apart[a], self._leads[a], self._members[a] = apart, leads, members
+        for a, b, known, apart, leads, members in reversed(self._undo):
+            self._apart[a], self._leads[a], self._members[a], self.known[b] = apart, leads, members, known
             self.root[self._members[b]] = b
         self._undo = []

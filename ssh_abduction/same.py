@@ -30,7 +30,6 @@ from typing import Self, TypeAlias
 import clingo
 
 from ssh_abduction import facts
-from ssh_abduction.annealing import Guess
 from ssh_abduction.apart import clique
 from ssh_abduction.chart import Chart, FramedChart, numbered
 from ssh_abduction.engine import ChartedEngine, Watch
@@ -89,13 +88,13 @@ class SameEngine(ChartedEngine):
         self._watch.check(SECONDS_A_PAIR * len(fits - self._fits if grown else fits))
         self.size = 0  # until clingo was told all of it
         if not grown:
-            self._begin(chart)
+            self._begin(chart, fits)
         self._give(chart, order, fits)
         self.size = size
         self.ground_seconds += time.perf_counter() - began
 
-    def _begin(self, chart: FramedChart) -> None:
-        """Take a control that knows nothing."""
+    def _begin(self, chart: FramedChart, fits: frozenset[Pair]) -> None:
+        """Take a control that knows nothing, for a chart of which these visits may be one."""
         self._first_nodes = len(chart.seen)
         self._control = self._new_control("same", "", ["--heuristic=Domain"])
         self._batch = -1
@@ -224,26 +223,26 @@ class SameEngine(ChartedEngine):
         """Tell clingo that to be the same is transitive, of these visits."""
         self._tell(facts.three_facts(self._parts, threes), "closed", self._parts)
 
-    def _labels_near(self, guess: Guess) -> Iterator[tuple[int, ...]]:
-        """Labels of all nodes where visits that the guess is sure of, and has at one place, are one; then others, with few dstates.
+    def _labels_near(self, guess: Sequence[int]) -> Iterator[tuple[int, ...] | None]:
+        """Labels of all nodes near those of a map: that first, then others, where visits of a place of its are one. None now and then.
 
-        A guess that fits the chart comes first, as it is. Then no others are one where that can be, until these are labels of a map. Then
-        clingo is asked for no lone nodes; of those that a core shows to be too many, one is left alone. Visits of places that cannot
-        all be as guessed are let free.
+        First no others are one where that can be, until these are labels of a map that is taken for `known`. Then clingo is asked for no
+        lone nodes; of those that a core shows to be too many, one is left alone. Visits of places that cannot all be as guessed are let free.
         """
-        if guess.fits(self._chart):
-            yield tuple(numbered(guess.labels(self._chart)))
-        states, sure = guess.states.tolist(), guess.sure.tolist()
+        yield tuple(numbered(guess))
+        states = _states(self._chart, guess)
         place_of: dict[int, int] = {}  # by the literal that two of its visits are one
         avoided: set[int] = set()
         for (i, j, r), literal in self._transitive.literals.items():
-            if sure[i] and sure[j]:
-                if states[i] // 4 == states[j] // 4 and (states[i] - states[j]) % 4 == r:
-                    place_of[literal] = states[i] // 4
-                else:
-                    avoided.add(-literal)
+            if states[i] // 4 == states[j] // 4 and (states[i] - states[j]) % 4 == r:
+                place_of[literal] = states[i] // 4
+            else:
+                avoided.add(-literal)
         patient = False
         while True:
+            if self._known and not patient:
+                patient, avoided = True, set(self._avoided)
+            yield None
             answer, core = self._verdict(self._pairs, [*place_of, *avoided])
             if core is not None:
                 if fewer := [literal for literal in core if literal in avoided]:
@@ -257,8 +256,6 @@ class SameEngine(ChartedEngine):
                 self._close(threes)
             else:
                 yield self._labels(answer or ())
-                if self._known and not patient:
-                    patient, avoided = True, set(self._avoided)
 
     def _together_impossible(self, places: list[int], place_of: Mapping[int, int]) -> list[int]:
         """Of places that cannot all be as guessed, few that cannot."""
@@ -383,6 +380,26 @@ class SameEngine(ChartedEngine):
             i, r = first.get(visit, (visit, 0))
             labels.append(number.setdefault((i, (slot - r) % 4), len(number)))
         return tuple(labels)
+
+
+def _states(chart: FramedChart, labels: Sequence[int]) -> list[int]:
+    """Of each visit 4 times the number of a place, and the slot of the place that slot 0 of the visit is. Visits that share a label are at one place."""
+    at: dict[int, list[tuple[int, int]]] = {}  # visits and slots, by label
+    faced: dict[int, list[tuple[int, int]]] = {}  # slots and labels, by visit
+    for (visit, slot), label in zip(chart.facing, labels, strict=True):
+        at.setdefault(label, []).append((visit, slot))
+        faced.setdefault(visit, []).append((slot, label))
+    states: dict[int, int] = {}
+    for first in faced:
+        work = [] if first in states else [first]
+        states.setdefault(first, 4 * first)
+        for visit in work:
+            for slot, label in faced[visit]:
+                for other, turned in at.pop(label, ()):
+                    if other not in states:
+                        states[other] = states[visit] // 4 * 4 + (states[visit] + slot - turned) % 4
+                        work.append(other)
+    return [states[visit] for visit in range(len(states))]
 
 
 def smaller(members: list[int], shrunk: Callable[[list[int]], list[int] | None], tries: int | None = None) -> list[int]:
