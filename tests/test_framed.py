@@ -99,7 +99,7 @@ def plainly_charted(engine: FramedEngine, size: int) -> FramedChart:
     return Chart.framed(engine._trace, engine._log, size)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(framed_traces(), framed_theories(), st.sets(st.sampled_from(SPEEDUPS)), st.data())
 def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off: set[str], data: st.DataObject) -> None:
     """With prefixes, cores and what is told in one go so small that all of it happens on short traces; and with any speed-ups off."""
@@ -149,7 +149,7 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         assert check(trace, ssh_map, theory) == ()
 
 
-@settings(max_examples=120, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(framed_traces(), framed_theories(), st.integers(0, 20))
 def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: Theory, sweeps: int) -> None:
     """From a guess of any quality. Names that do not fit a frame, or have no streets, are no maps; and clingo may need more names than it had."""
@@ -190,9 +190,9 @@ def test_a_limit_ends_the_search_beside(limit: float) -> None:
     assert check(trace, solution.maps[0], Theory.topological()) == ()
 
 
-@pytest.mark.parametrize(("side", "steps", "seed"), [(4, 120, 3), (4, 120, 7), (5, 200, 4), (5, 400, 5)])
+@pytest.mark.parametrize(("side", "steps", "seed"), [(4, 120, 3), (4, 120, 7), (5, 200, 4)])
 def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, seed: int) -> None:
-    """There are 2 to 42 in these mazes, most of which have no streets."""
+    """There are several in these mazes, most of which have no streets."""
     walk = maze(side, side, steps=steps, seed=seed, stars=True)
     expected = solve(walk.trace, Theory.topological(), maps=0, speedups=Speedups.without("annealed"))
     with (
@@ -508,7 +508,8 @@ def places(walk: Walk, chart: FramedChart) -> list[object]:
 def test_annealing_finds_the_places_of_a_maze(seed: int) -> None:
     walk = maze(4, 4, steps=800, seed=seed, stars=True)
     chart = Chart.framed(walk.trace, Log(walk.trace, Theory(star="frame")))
-    guess = annealed(chart)
+    with patch.object(annealing, "ANNEALED", ((0.5, 500),)):
+        guess = annealed(chart)
     assert guess.sure.all()
     guessed = (guess.states // 4).tolist()
     assert len(set(zip(guessed, places(walk, chart), strict=True))) == len(set(guessed)) == len(set(places(walk, chart)))
@@ -582,7 +583,7 @@ def node_labels(ssh_map: SSHMap, chart: FramedChart) -> list[int]:
     return [ssh_map.labels[chart.node_of.index(node)] for node in range(len(chart.seen))]
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(framed_traces(), framed_theories(), st.data())
 def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: Theory, data: st.DataObject) -> None:
     """So merging by evidence may keep to it."""
@@ -600,7 +601,7 @@ def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: T
         assert all(labels[a] == labels[b] for a, b in one)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(framed_traces(), framed_theories(), st.lists(st.integers(-1, 4), min_size=9, max_size=9), st.booleans())
 def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[int], told: bool) -> None:
     """Of the causal axioms; and where single streets fit it, others do."""
