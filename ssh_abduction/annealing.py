@@ -90,14 +90,6 @@ class Guess:
             for label, (visit, _) in zip(self._all(chart), chart.facing, strict=True)
         ]
 
-    def fits(self, chart: FramedChart) -> bool:
-        """Whether it is a way to be at places: nothing tells visits of one place apart, and each action leads to one dstate."""
-        visits = np.arange(len(self.states))
-        turned = (self.states[:, None] - self.states) % 4
-        places = self.states // 4
-        misfit = chart.misfits[turned, visits[:, None], visits] & (places[:, None] == places) & (visits[:, None] != visits)
-        return not misfit.any() and chart.is_map(self.labels(chart))
-
 
 def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False) -> Guess:
     """A guess at the states of all visits. `check` is called now and then, and may raise.

@@ -10,7 +10,9 @@ a lower bound, and if some answer of that cost has streets, all minimal maps are
 that are one. If no single street does, or visits are too many for that, streets.lp is asked which labels clash: smallest sets of nodes at
 dstates that no streets fit; same.lp is told that these do not go together. As every map of the full theory keeps that, bounds still hold.
 
-*Beside.* What takes long is guessed in another thread (`annealing.py`). Near the guess, maps are made here, while there it is proven with
+*Beside.* What takes long is guessed in another thread (`annealing.py`). Where the guess cannot be right its places are let free, and what is there
+is merged by evidence (`merging.py`), while streets.lp says which visits cannot be one, and which have to be: so a guess becomes a map. Near
+it, maps are made here, while there it is proven with
 names, from the guess outwards, how many dstates the causal axioms need (`nearby.py`). Where a map has so few, it has the fewest; and the same
 names then list all ways to be at so few. Some of them fit no frame, which streets.lp sees, or have no streets; but each map of the full
 theory is among them.
@@ -43,6 +45,7 @@ from ssh_abduction.trace import Trace
 
 CLASHES = 30  # that clingo is told of in one go
 MANY_DSTATES = 50  # above which it is asked for single streets first
+ALL_STREETS = 15  # times as long as single ones, about, all take to ground
 MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much to say: some forty rules for each of them
 # clasp's way to list answers in which no atom that is shown can be spared:
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
@@ -190,10 +193,7 @@ class FramedEngine(SameEngine):
         raise AssertionError
 
     def _has_single_streets(self, chart: FramedChart, labels: Sequence[int]) -> bool:
-        control = self._streets_of(chart)
-        control.add("base", [], facts.settled_facts(self._theory, chart, labels, range(len(labels)), single=True))
-        control.ground([("base", []), ("again", []), ("least", [])])
-        return bool(control.solve().satisfiable)
+        return bool(self._settled_streets(chart, labels, single=True).solve().satisfiable)
 
     def _told(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
         """Which nodes are apart, and which are one, where these labels hold of all nodes but some; None where that cannot be."""
@@ -351,15 +351,21 @@ class FramedEngine(SameEngine):
         """A control for the streets that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
         self._watch.check(0.0 if single else self._street_seconds)
         began = time.perf_counter()
-        control = self._streets_of(self._chart, options)
-        control.load(encodings.path("preference"))
-        nodes = range(len(labels)) if nodes is None else nodes
-        control.add("base", [], facts.settled_facts(self._theory, self._chart, labels, nodes, single=single))
-        control.ground([("base", []), *([("again", [])] if single else []), ("least", [])])
+        control = self._settled_streets(self._chart, labels, options, nodes, single=single)
         self._watch.check()
         seconds = time.perf_counter() - began
-        self._street_seconds = self._street_seconds if single else seconds
+        self._street_seconds = self._street_seconds or ALL_STREETS * seconds if single else seconds
         self.ground_seconds += seconds
+        return control
+
+    def _settled_streets(
+        self, chart: FramedChart, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None, *, single: bool
+    ) -> clingo.Control:
+        control = self._streets_of(chart, options)
+        control.load(encodings.path("preference"))
+        nodes = range(len(labels)) if nodes is None else nodes
+        control.add("base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single))
+        control.ground([("base", []), *([("again", [])] if single else []), ("least", [])])
         return control
 
     def _forbid(self, labels: Sequence[int]) -> None:
