@@ -53,9 +53,13 @@ class Stopped(Exception):  # noqa: N818 - not an error
 
 
 class Watch:
-    """The limits of a search: `check` raises when one is over. Time that the caller of a stream takes does not count."""
+    """The limits of a search: `check` raises when one is over. Time that the caller of a stream takes does not count.
 
-    def __init__(self, limit: float | None, memory: int | None, on_tick: Callable[[], None]) -> None:
+    beside  the watch of the search that this one is beside. That ends it, and what cannot be interrupted is not begun where too little time is left
+    """
+
+    def __init__(self, limit: float | None, memory: int | None, on_tick: Callable[[], None], *, beside: Watch | None = None) -> None:
+        self._beside = beside
         self._on_tick = on_tick
         self._next_tick = TICK
         self._limit = limit
@@ -95,8 +99,14 @@ class Watch:
             self._on_tick()
         if self._allowed is not None and self.elapsed() + ahead > self._allowed:
             raise Stopped("time limit")
+        if ahead and self._beside is not None and self._beside.left() < ahead:
+            raise Stopped("time limit")
         if self._memory is not None and peak_memory() > self._memory:
             raise Stopped("memory limit")
+
+    def left(self) -> float:
+        """Seconds until the time limit."""
+        return math.inf if self._limit is None else self._limit - self.elapsed()
 
 
 def peak_memory() -> float:

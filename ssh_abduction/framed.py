@@ -46,6 +46,7 @@ from ssh_abduction.trace import Trace
 CLASHES = 30  # that clingo is told of in one go
 MANY_DSTATES = 50  # above which it is asked for single streets first
 ALL_STREETS = 15  # times as long as single ones, about, all take to ground
+PREPARED = 2.5  # times as long, until clasp has prepared to solve and can be stopped
 MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much to say: some forty rules for each of them
 # clasp's way to list answers in which no atom that is shown can be spared:
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
@@ -150,7 +151,7 @@ class FramedEngine(SameEngine):
 
     def _search_beside(self, chart: FramedChart) -> None:
         """Begin to guess in another thread, and to prove from there that the causal axioms need so many dstates."""
-        watch, pinned = Watch(None, None, lambda: None), self.clique or [0]
+        watch, pinned = Watch(None, None, lambda: None, beside=self._watch), self.clique or [0]
         apart = chart.apart(len(chart.seen), pinned)
         self._named = NearbyEngine(
             self._trace,
@@ -349,7 +350,7 @@ class FramedEngine(SameEngine):
         self, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None, *, single: bool = False
     ) -> clingo.Control:
         """A control for the streets that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
-        self._watch.check(0.0 if single else self._street_seconds)
+        self._watch.check(0.0 if single else PREPARED * self._street_seconds)
         began = time.perf_counter()
         control = self._settled_streets(self._chart, labels, options, nodes, single=single)
         self._watch.check()

@@ -182,7 +182,7 @@ class NamedEngine(ChartedEngine):
         except NoFrame:
             return
         beside = self._has_processors()
-        watch = Watch(None, None, lambda: None) if beside else self._watch
+        watch = Watch(None, None, lambda: None, beside=self._watch) if beside else self._watch
         engine = NearbyEngine(
             self._trace,
             self._theory,

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import random
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -45,6 +46,7 @@ CONFLICTS = 2000  # after which a question is left open, at first; then twice as
 WIDE = 10  # as many times as many, where nothing is assumed of steps
 REGIONS = 40  # parts of the map that are drawn anew in vain, before anything else is tried
 FIRST_REGION = 10  # dstates of such a part, at first
+PREPARING = 1.0  # times as long as grounding took, about, clingo prepares to solve, and cannot be stopped
 AT_A_TIME = 500  # links that clingo is given in one go
 
 Labels: TypeAlias = list[int]
@@ -139,6 +141,7 @@ class NearbyEngine(ChartedEngine):
 
     def _take(self, counts: Mapping[int, int]) -> None:
         """Take a control with so many spare names for each view, one more, and a rest."""
+        began = time.perf_counter()
         seen = self._chart.seen
         names = [(name, seen[node]) for name, node in enumerate(self.clique)]
         self._spare: dict[int, range] = {}
@@ -171,6 +174,7 @@ class NearbyEngine(ChartedEngine):
             far = [(t, int(u)) for t in new for u in np.flatnonzero(self._far[t, :t])] if self._far is not None else []
             self._control.add(part, [], facts.batch_facts(batch, nodes, added, far))
             self._control.ground([(part, []), ("more", facts.numbers(batch))])
+        self._watch.check(PREPARING * (time.perf_counter() - began))
 
     def _literal(self, symbol: clingo.Symbol) -> int:
         atom = self._control.symbolic_atoms[symbol]
