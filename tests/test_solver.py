@@ -198,7 +198,8 @@ def test_memory_limit_stops_with_a_status() -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 def test_ctrl_c_leaves_the_best_map() -> None:
     program = textwrap.dedent("""
-        import sys
+        import signal, sys
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
         sys.path.insert(0, sys.argv[1])
         from test_solver import too_hard
         from ssh_abduction import Theory, solve
