@@ -41,8 +41,8 @@ WEIGHT = 0.002  # of the prior: for each of so many states
 STATES = 60  # that an action may lead to
 # An attempt ends where all travels lead where most such travels do. To what power probabilities are taken in the first of so many sweeps:
 ANNEALED = ((0.5, 1500),)
+# The same, and how many visits each name has, where a rough guess will do: one of so many travels may lead elsewhere.
 FEW = 200
-# The same, and how many visits each name has, where a rough guess will do. There one of FEW may lead elsewhere.
 ROUGH, ROUGH_VISITS = ((0.6, 300), *10 * ((0.75, 150),)), 40
 SECONDS = 10.0  # after which there is no other attempt
 COLD = 0.95  # to what power in the last of them
@@ -67,16 +67,12 @@ class Guess:
 
     def labels(self, chart: FramedChart) -> list[int]:
         """A number for the dstate of each node of the chart; -1 where the guess is not sure."""
-        sure = self.sure.tolist()
-        return [label if sure[visit] else -1 for label, (visit, _) in zip(self._all(chart), chart.facing, strict=True)]
+        states, sure = self.states.tolist(), self.sure.tolist()
+        return [states[visit] - states[visit] % 4 + (states[visit] + slot) % 4 if sure[visit] else -1 for visit, slot in chart.facing]
 
-    def _all(self, chart: FramedChart) -> list[int]:
+    def loosened(self, chart: FramedChart, travels: int) -> Guess:
+        """The guess, not sure of visits to places at which the same travel leads to several, to those it leads to, or so many travels further."""
         states = self.states.tolist()
-        return [states[visit] - states[visit] % 4 + (states[visit] + slot) % 4 for visit, slot in chart.facing]
-
-    def loosened(self, chart: FramedChart, travels: int) -> list[int]:
-        """The labels where nothing is known of places at which the same travel leads to several, of those it leads to, or so many travels further."""
-        states, unsure = self.states.tolist(), {visit for visit, sure in enumerate(self.sure.tolist()) if not sure}
         leads: dict[tuple[int, int, int], set[int]] = {}
         for visit, (slot, action) in chart.leaves.items():
             here = states[visit]
@@ -85,10 +81,7 @@ class Guess:
         joined = [(here // 4, there // 4) for here, there in pairwise(states)]
         for _ in range(travels):
             loose |= {place for pair in joined if loose.intersection(pair) for place in pair}
-        return [
-            -1 if states[visit] // 4 in loose or visit in unsure else label
-            for label, (visit, _) in zip(self._all(chart), chart.facing, strict=True)
-        ]
+        return Guess(self.states, self.sure & ~np.isin(self.states // 4, list(loose)))
 
 
 def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False) -> Guess:

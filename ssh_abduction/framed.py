@@ -180,7 +180,7 @@ class FramedEngine(SameEngine):
             starts = [
                 mended(guess.labels(chart), chart),
                 guess.labels(chart),
-                *(guess.loosened(chart, travels) for travels in range(LOOSENED)),
+                *(guess.loosened(chart, travels).labels(chart) for travels in range(LOOSENED)),
             ]
             maps = [(merged_near(apart, chart.links, start, check=check), start) for start in starts]
             ranked = sorted(((labels, start) for labels, start in maps if labels), key=lambda pair: len(set(pair[0])))
@@ -233,7 +233,7 @@ class FramedEngine(SameEngine):
         return self._named if self._named and self._named.bound == dstates > self._least else None
 
     def _guesses(self, guess: Sequence[int]) -> Iterator[Found]:
-        """Maps near a guess, if it leads to any, each with fewer dstates than the one before; then better streets for the last."""
+        """Maps near a guess, if it leads to any, each with fewer dstates than the one before; and better streets for each."""
         failed = 0
         for labels in self._labels_near(guess):
             yield from self._bettered()
@@ -385,7 +385,7 @@ class FramedEngine(SameEngine):
         """Say what order and sides demand of a street that these labels contradict. False if all such streets have been told of."""
         control = self._streets_of(self._chart)
         control.add("base", [], facts.settled_labels(enumerate(labels)))
-        control.ground([("base", []), ("contrary", [])])
+        control.ground([("base", []), ("again", []), ("contrary", [])])
         contrary, twice = next(self._answers(facts.read_contrary, "ignore", 1, control=control))
         stand = {label: self._chart.facing[node] for node, label in enumerate(labels)}
         if any(self._say_once("street", *stand[dstate]) for dstate in contrary):
@@ -465,14 +465,12 @@ class FramedEngine(SameEngine):
 
 def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:
     """Nodes x nodes: they are of visits some nodes of which have labels that are at different places."""
-    pairs = np.asarray([*elsewhere, (0, 0)][:-1], dtype=int).reshape(-1, 2)
+    pairs = np.array(list(elsewhere), dtype=int).reshape(-1, 2)
     different = np.zeros((max(labels) + 1,) * 2, dtype=bool)
     different[pairs[:, 0], pairs[:, 1]] = different[pairs[:, 1], pairs[:, 0]] = True
-    visits = np.array([visit for visit, _ in chart.facing])
-    order = np.argsort(visits, kind="stable")
-    starts = np.flatnonzero(np.diff(visits[order], prepend=-1))
-    label = np.asarray(labels)[order]
-    rows = np.logical_or.reduceat(different[label], starts, axis=0)
-    apart = np.logical_or.reduceat(rows[:, label], starts, axis=1)
+    visits = np.array([visit for visit, _ in chart.facing])  # in order, as nodes are numbered by the first step at them
+    starts = np.flatnonzero(np.diff(visits, prepend=-1))
+    rows = np.logical_or.reduceat(different[list(labels)], starts, axis=0)
+    apart = np.logical_or.reduceat(rows[:, list(labels)], starts, axis=1)
     nodes: Matrix = apart[np.ix_(visits, visits)]
     return nodes

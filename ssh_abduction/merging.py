@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.apart import Matrix, apartness
+from ssh_abduction.chart import numbered
 
 # Least evidence for a merge, and how much it has to be ahead of the next; among how many known dstates at most:
 DEMANDS = ((10, 1), (5, 1), (5, 2), (3, 1), (3, 3), (2, 2), (2, 10), (1, 3), (1, 100), (0, 1), (0, 2), (0, 1000))
@@ -48,7 +49,7 @@ def merged_near(
     apart: Matrix,
     links: Iterable[Link],
     guess: Sequence[int],
-    tell: Callable[[Sequence[int], Sequence[int]], Told | None] = lambda labels, open_nodes: _NOTHING,
+    tell: Callable[[Sequence[int], Sequence[int]], Told | None] | None = None,
     check: Callable[[], None] = lambda: None,
 ) -> list[int] | None:
     """The dstate of each node of a chart in some map near a guess, numbered by first node. None where what is told rules that out.
@@ -64,12 +65,8 @@ def merged_near(
     for node, label in enumerate(guess):
         if label >= 0:
             classes.merge(first[label], node)
-    if classes.settle_all(check, lambda: classes.heed(tell(classes.labels(), classes.unsettled().tolist()))):
-        return classes.labels()
-    return None
-
-
-_NOTHING: Told = (np.zeros((0, 0), dtype=bool), ())
+    agrees = classes.settle_all(check, lambda: not tell or classes.heed(tell(classes.labels(), classes.unsettled().tolist())))
+    return classes.labels() if agrees else None
 
 
 class _Classes:
@@ -93,8 +90,7 @@ class _Classes:
 
     def labels(self) -> list[int]:
         """The class of each step, numbered by first step."""
-        number: dict[int, int] = {}
-        return [number.setdefault(root, len(number)) for root in self.root.tolist()]
+        return numbered(self.root.tolist())
 
     def settle_all(self, check: Callable[[], None], agrees: Callable[[], bool] = lambda: True) -> bool:
         """Make every class a known dstate. Returns whether it agrees with what else is known, whenever some were."""
@@ -116,10 +112,9 @@ class _Classes:
         if told is None:
             return False
         apart, one = told
-        if len(apart):
-            self._apart |= apart
-            for root in np.flatnonzero(np.bincount(self.root) > 1):
-                self._apart[root] |= apart[self._members[root]].any(axis=0)
+        self._apart |= apart
+        for root in np.flatnonzero(np.bincount(self.root) > 1):
+            self._apart[root] |= apart[self._members[root]].any(axis=0)
         for a, b in one:
             self.merge(a, b, forced=True)
         return True

@@ -40,6 +40,7 @@ from ssh_abduction.merging import merged_near
 from ssh_abduction.nearby import Beside, NearbyEngine
 from ssh_abduction.proof import check_bound
 from ssh_abduction.replay import Log
+from ssh_abduction.solver import Cost
 from ssh_abduction.speedups import SPEEDUPS
 
 PLAIN = Speedups.without(SPEEDUPS)
@@ -166,7 +167,9 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: The
         maps = tuple(search)
     found = search.solution(maps)
     assert found.status is expected.status
+    assert (found.cost is None) == (expected.cost is None)
     if found.cost and expected.cost:
+        assert found.cost in map(Cost.of, expected.maps)
         assert [getattr(found.cost, name) for name in theory.prefer] == [getattr(expected.cost, name) for name in theory.prefer]
     assert set(maps) == set(expected.maps)
     assert len(set(maps)) == len(maps)
