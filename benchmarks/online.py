@@ -1,9 +1,10 @@
 """How long a robot waits for its map at each step: a walk that explores a 10 x 10 maze with stars.
 
-    python benchmarks/online.py [--steps 1000] [--limit 0.5] [--size 10]
+    python benchmarks/online.py [--steps 1000] [--limit 0.5] [--size 10] [--seed 0] [--drive 0.05]
 
 Optimal are the steps at which the answer was proven minimal; at the others it was a consistent map and a lower bound. `visited` are the
-dstates of the world that the robot has been in. At the checkpoints the trace is solved anew, in at most ANEW seconds.
+dstates of the world that the robot has been in. Between two steps the robot drives for so many seconds, as no robot is faster, which is the
+time in which maps are guessed. At the checkpoints the trace is solved anew, in at most ANEW seconds.
 """
 
 from __future__ import annotations
@@ -28,34 +29,41 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--size", type=int, default=10)
     parser.add_argument("--limit", type=float, default=0.5)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--drive", type=float, default=0.05)
     options = parser.parse_args()
-    walk = maze(options.size, options.size, steps=options.steps, seed=0, stars=True)
+    walk = maze(options.size, options.size, steps=options.steps, seed=options.seed, stars=True)
     trace = walk.trace
     first, *rest = trace.steps
     mapper = OnlineMapper(first.view or "", star=first.star, limit=options.limit)
     seconds: list[float] = []
     optimal = complete = 0
+    sizes: list[float] = []
     print(
         f"{'steps':>6} {'status':10} {'dstates':>8} {'bound':>6} {'visited':>8} {'maps':>5} {'step, ms':>9} {'so far, s':>10} {'anew, s':>8} {'ratio':>7}"
     )
     for action, step in zip(trace.actions, rest, strict=True):
+        time.sleep(options.drive)
         began = time.perf_counter()
         solution = mapper.observe(action, step.view or "", star=step.star)
         seconds.append(time.perf_counter() - began)
         optimal += solution.status is Status.OPTIMAL
         complete += solution.complete
+        visited = len(set(walk.truth[: solution.steps]))
+        sizes.append(solution.cost.dstates / visited if solution.cost else 0.0)
         if solution.steps in CHECKPOINTS:
             anew = solve(trace.prefix(solution.steps), limit=ANEW).seconds.total
             dstates = solution.cost.dstates if solution.cost else 0
             print(
-                f"{solution.steps:6} {solution.status.value:10} {dstates:8} {solution.bound.dstates or 0:6} {len(set(walk.truth[: solution.steps])):8} {solution.count:5} "
+                f"{solution.steps:6} {solution.status.value:10} {dstates:8} {solution.bound.dstates or 0:6} {visited:8} {solution.count:5} "
                 f"{1000 * seconds[-1]:9.2f} {sum(seconds):10.2f} {anew:8.2f} {anew / seconds[-1]:7.0f}",
                 flush=True,
             )
     print(
         f"{len(seconds)} steps, {mapper.searches} searches: median {1000 * percentile(seconds, 0.5):.2f} ms, "
         f"99th percentile {1000 * percentile(seconds, 0.99):.0f} ms, most {1000 * max(seconds):.0f} ms; "
-        f"optimal {optimal / len(seconds):.1%}, all minimal maps {complete / len(seconds):.1%}"
+        f"optimal {optimal / len(seconds):.1%}, all minimal maps {complete / len(seconds):.1%}; "
+        f"dstates by visited: median {percentile(sizes, 0.5):.2f}, most {max(sizes):.2f}"
     )
 
 

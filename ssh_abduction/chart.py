@@ -165,9 +165,13 @@ class FramedChart(Chart):
         facing = np.asarray(self.facing[:most])
         visits, slots = facing.T
         other_visits, other_slots = (facing if others is None else facing[list(others)]).T
-        rotated = (other_slots - slots[:, None]) % 4
-        apart: NDArray[np.bool_] = self.misfits[rotated, visits[:, None], other_visits]
-        apart |= (visits[:, None] == other_visits) & (rotated != 0)
+        apart = np.empty((len(visits), len(other_visits)), dtype=bool)
+        for slot in range(4):
+            rows = np.flatnonzero(slots == slot)
+            for other_slot in range(4):
+                columns = np.flatnonzero(other_slots == other_slot)
+                apart[np.ix_(rows, columns)] = self.misfits[(other_slot - slot) % 4][np.ix_(visits[rows], other_visits[columns])]
+        apart |= (visits[:, None] == other_visits) & (slots[:, None] != other_slots)
         return apart
 
     @cached_property
@@ -196,7 +200,9 @@ class FramedChart(Chart):
         views = np.full((visits, 4), -1)
         for (visit, slot), seen in zip(self.facing, self.seen, strict=True):
             views[visit, slot] = seen
-        stars = np.asarray(self.stars)
+        number: dict[tuple[int, ...], int] = {}
+        # stars[r] is a number for each visit's star, as seen from its slot r
+        stars = [np.array([number.setdefault(star[r:] + star[:r], len(number)) for star in self.stars]) for r in range(4)]
         leaves = np.full(visits, -1)  # the slot that a visit ends at, none for the last
         action = np.full(visits, -1)
         for visit, (slot, done) in self.leaves.items():
@@ -207,10 +213,10 @@ class FramedChart(Chart):
         for i in range(visits - 1, -1, -1):
             for r in range(4):
                 row = misfits[r, i]
-                for slot in range(4):
-                    there = (slot + r) % 4
-                    row |= stars[:, there] != stars[i, slot]
-                    row |= (views[i, slot] >= 0) & (views[:, there] >= 0) & (views[:, there] != views[i, slot])
+                row |= stars[r] != stars[0][i]
+                for slot in np.flatnonzero(views[i] >= 0).tolist():
+                    there = views[:, (slot + r) % 4]
+                    row |= (there >= 0) & (there != views[i, slot])
                 if i < visits - 1:
                     alike = ((leaves[i] + r) % 4 == leaves) & (action == action[i])
                     row[:-1] |= alike[:-1] & misfits[0, i + 1, 1:]

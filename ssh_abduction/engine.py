@@ -360,12 +360,7 @@ class ChartedEngine(Engine):
         return self.next_size(self.size)
 
     def _has_processors(self) -> bool:
-        """Whether a search may have two threads."""
-        if not self._speedups.threads:
-            return False
-        from joblib import cpu_count  # takes its time to load
-
-        return bool(cpu_count() > 1)
+        return has_processors(self._speedups)
 
     def _new_control(self, encoding: str, base: str, options: Sequence[str]) -> clingo.Control:
         """A control with an encoding, and these facts in its base."""
@@ -374,3 +369,12 @@ class ChartedEngine(Engine):
         control.add("base", [], base if self._speedups.watched else f"{base}\n{facts.watched()}.")
         control.ground([("base", [])])
         return control
+
+
+def has_processors(speedups: Speedups) -> bool:
+    """Whether a search may have two threads."""
+    if not speedups.threads:
+        return False
+    from joblib import cpu_count  # takes its time to load
+
+    return bool(cpu_count() > 1)

@@ -20,8 +20,11 @@ theory is among them.
 
 from __future__ import annotations
 
+import threading
 import time
+import weakref
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -34,14 +37,15 @@ from ssh_abduction import encodings, facts
 from ssh_abduction.annealing import SECONDS, attempts
 from ssh_abduction.apart import Matrix
 from ssh_abduction.chart import Chart, FramedChart, NoFrame, numbered
-from ssh_abduction.engine import Found, Watch
-from ssh_abduction.merging import Told, merged_near
+from ssh_abduction.engine import Found, Stopped, Watch, has_processors
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.merging import Told, kept, merged_near
 from ssh_abduction.nearby import Beside, NearbyEngine, mended
 from ssh_abduction.replay import Log
 from ssh_abduction.same import SECONDS_A_PAIR, Pair, SameEngine, TakesLong, smaller
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
-from ssh_abduction.trace import Trace
+from ssh_abduction.trace import Step, Trace
 
 CLASHES = 30  # that clingo is told of in one go
 MANY_DSTATES = 50  # above which it is asked for single streets first
@@ -173,7 +177,7 @@ class FramedEngine(SameEngine):
 
     def _guessed_labels(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
         """Labels of a map of the causal axioms: one that has streets, as far as single streets tell, or where that is not soon found one of few dstates."""
-        began = time.perf_counter()
+        began = time.thread_time()  # a thread may be made to wait
         apart = chart.apart(len(chart.seen))
         found: list[list[int]] = []
         for _, guess in attempts(replace(chart, elsewhere=()), check):
@@ -189,9 +193,27 @@ class FramedEngine(SameEngine):
                 if labels and self._has_single_streets(chart, labels):
                     return labels
             found.append(ranked[0][0])
-            if time.perf_counter() - began > SECONDS:
+            if time.thread_time() - began > SECONDS:
                 return min(found, key=lambda labels: len(set(labels)))
         raise AssertionError
+
+    def guessed(self) -> Found | None:
+        """A map of the whole trace made of a guess, without a search: None where none is found soon."""
+        try:
+            self._chart = self._charted(len(self._trace))
+        except NoFrame:
+            return None
+        labels = self._guessed_labels(self._chart, self._watch.check)
+        return next(self._streets(_Naming(labels, self._street_control(labels, single=True)), "ignore"), None)
+
+    def mended(self, known: Sequence[int]) -> Found | None:
+        """A map of the whole trace in which the first steps keep these dstates, as far as can be, and all else is new, if that has streets."""
+        chart = self._chart = Chart.framed(self._trace, self._log)
+        guess = [-1] * len(chart.seen)
+        for node, label in zip(chart.node_of, known, strict=False):
+            guess[node] = label
+        labels = kept(chart.apart(len(chart.seen)), chart.links, guess)
+        return next(self._streets(_Naming(labels, self._street_control(labels, single=True)), "ignore"), None)
 
     def _has_single_streets(self, chart: FramedChart, labels: Sequence[int]) -> bool:
         return bool(self._settled_streets(chart, labels, single=True).solve().satisfiable)
@@ -461,6 +483,78 @@ class FramedEngine(SameEngine):
         control.load(encodings.path("streets"))
         control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
         return control
+
+
+def mended_map(trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None) -> SSHMap | None:
+    """A map of a trace near one of its first steps that its later steps contradict, if there is one in which all that does not fit is new."""
+    watch = watch or Watch(None, None, lambda: None)
+    found = FramedEngine(trace, theory, watch, Log(trace, theory), speedups).mended(known.labels)
+    return found.map if found else None
+
+
+class MapGuess:
+    """A map of a trace that grows, made in a thread of its own. The thread ends when this is no longer referred to, and with the program.
+
+    A map is made of a guess, unless one is known. As the trace has grown meanwhile, and may contradict it, it is mended at the end.
+
+    steps    those of the trace so far; more may be appended
+    may_run  to be cleared where others are in a hurry, as Python runs but one thread at a time
+    """
+
+    def __init__(self, steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None = None) -> None:
+        self.may_run = threading.Event()
+        self._found: Future[SSHMap | None] = Future()
+        watch = _PausedWatch(self.may_run)
+        thread = threading.Thread(target=_guess, args=(steps, theory, speedups, known, watch, self._found), daemon=True)
+        weakref.finalize(self, _end, watch, self.may_run, thread)
+        thread.start()
+
+    @staticmethod
+    def begun(steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None = None) -> MapGuess | None:
+        """None where there is no second processor, or guesses are not wanted."""
+        return MapGuess(steps, theory, speedups, known) if speedups.annealed and has_processors(speedups) else None
+
+    def done(self) -> bool:
+        return self._found.done()
+
+    def map(self) -> SSHMap | None:
+        """The map of the first steps, if one was found. Waits until that is known."""
+        return self._found.result()
+
+
+class _PausedWatch(Watch):
+    """The watch of a search that waits until it may run."""
+
+    def __init__(self, may_run: threading.Event) -> None:
+        super().__init__(None, None, lambda: None)
+        self._may_run = may_run
+
+    def check(self, ahead: float = 0.0) -> None:
+        self._may_run.wait()
+        super().check(ahead)
+
+
+def _guess(
+    steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None, watch: Watch, found: Future[SSHMap | None]
+) -> None:
+    try:
+        if not known:
+            trace = Trace(tuple(steps))
+            guessed = FramedEngine(trace, theory, watch, Log(trace, theory), speedups).guessed()
+            known = guessed.map if guessed else None
+        if known and len(steps) > len(known.labels):
+            known = mended_map(Trace(tuple(steps)), theory, known, speedups, watch)
+        found.set_result(known)
+    except Stopped:
+        found.set_result(None)
+    except BaseException as error:
+        found.set_exception(error)
+
+
+def _end(watch: Watch, may_run: threading.Event, thread: threading.Thread) -> None:
+    watch.interrupted = True
+    may_run.set()
+    thread.join()
 
 
 def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:

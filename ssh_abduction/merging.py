@@ -60,13 +60,24 @@ def merged_near(
     tell   is asked what follows from labels of all nodes, some of which are still open, whenever these have changed; None: they contradict
     check  called now and then; may raise
     """
+    classes = _guessed(apart, links, guess)
+    agrees = classes.settle_all(check, lambda: not tell or classes.heed(tell(classes.labels(), classes.unsettled().tolist())))
+    return classes.labels() if agrees else None
+
+
+def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int]:
+    """The same where nothing is merged but what has to be: what is not known, or leaves its label, is something new."""
+    return _guessed(apart, links, guess).labels()
+
+
+def _guessed(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> _Classes:
+    """Nodes that a guess has at one dstate are merged, as far as they can be one; what follows from that is merged, too."""
     first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
     classes = _Classes(apart.copy(), links, first.values())
     for node, label in enumerate(guess):
         if label >= 0:
             classes.merge(first[label], node)
-    agrees = classes.settle_all(check, lambda: not tell or classes.heed(tell(classes.labels(), classes.unsettled().tolist())))
-    return classes.labels() if agrees else None
+    return classes
 
 
 class _Classes:

@@ -25,9 +25,13 @@ which is at least what was proved before. A theory `without` axioms is solved an
 
 When time is short
 ------------------
-A map that predicts the step is minimal even if there is no time to look for others. Once there is none, the answer is feasible: a map that
-was found and goes on predicting, or else the sketch (`sketch.py`), with the last bound, which holds for the longer trace by (1). clingo is
-asked again when the trace is longer by RETRY and PAUSE; it goes on where it was stopped, and may prove a map minimal again.
+A map that predicts the step is minimal even if there is no time to look for others. Once there is none, the answer is feasible: the last bound, which
+holds for the longer trace by (1), and a map. That is a map of fewer steps that goes on like a sketch (`sketch.py`), and that the checker finds
+consistent; or a sketch of all steps. Where places have frames, a map that is contradicted is mended: what does not fit is something new. clingo is asked again when the trace is longer by RETRY and PAUSE; it goes on where it was stopped, and may
+prove a map minimal again.
+
+Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`framed.py`), one after another, in a thread of their own,
+and mended there where that takes longer than a step may.
 """
 
 from __future__ import annotations
@@ -36,18 +40,27 @@ import importlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from ssh_abduction.checker import check
 from ssh_abduction.errors import TraceError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.replay import Outcome, observation
 from ssh_abduction.sketch import Sketch
-from ssh_abduction.solver import Cost, Search, Seconds, Solution, Status
+from ssh_abduction.solver import ALL, Cost, Search, Seconds, Solution, Status, has_frames
+from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Step, Trace, View
 
+if TYPE_CHECKING:
+    from ssh_abduction.framed import MapGuess
+
 RETRY = 1.01  # after a search that was stopped, the trace grows by this factor before the next, so that few steps are slow,
 PAUSE = 2  # and by so many steps at least
+DRAFTS = 3  # maps of fewer steps that go on like sketches, at most
+GUESSED = 100  # steps from which on maps are guessed
+MENDING = 5e-7  # seconds that it takes to mend a map, about, by the square of the number of steps
+GUESS_AGAIN = 1.05  # the trace grows by this factor before the next guess
 
 
 class OnlineMapper:
@@ -58,6 +71,7 @@ class OnlineMapper:
     star     the openings seen at first, as in Step, if the theory uses stars
     limit    seconds that a step may take, about: clingo cannot be stopped while it grounds a step. None waits for the exact answer
     maps     keep at most so many maps; 0 keeps all
+    speedups  what makes solving fast, as for Search
     """
 
     def __init__(
@@ -68,6 +82,7 @@ class OnlineMapper:
         star: Sequence[float] | None = None,
         limit: float | None = 0.5,
         maps: int = 100,
+        speedups: Speedups = ALL,
     ) -> None:
         if theory and theory.level == "causal":
             importlib.import_module("ssh_abduction.named")  # now rather than at the step that first needs it, as it takes its time
@@ -77,7 +92,7 @@ class OnlineMapper:
         self.theory = theory.resolve(Trace((first,)))
         self.searches = 0  # how often clingo was asked
         self._without_stars = theory.star == "auto" and self.theory.star == "none"
-        self._limit, self._most = limit, maps
+        self._limit, self._most, self._speedups = limit, maps, speedups
         self._steps = [first]
         self._seen = [observation(first, self.theory)]
         self._actions: dict[str, Action] = {}
@@ -85,7 +100,11 @@ class OnlineMapper:
         self._complete = False
         self._cost: Cost | None = None
         self._maps: list[_Replayed] = []
+        self._drafts: list[Sketch] = []  # beyond maps of fewer steps, the best first
         self._sketches = [Sketch(first, self.theory, homing) for homing in (True, False)]
+        self._guess: MapGuess | None = None
+        self._next_guess = GUESSED  # not before the trace has so many steps
+        self._mending = MENDING  # seconds, by the square of the number of steps
         self._search: Search | None = None
         self._asked: Solution | None = None  # what it said
         self._next_search = 0  # not before the trace has so many steps
@@ -103,7 +122,16 @@ class OnlineMapper:
         Raises TraceError where the step does not fit theory and trace; the mapper stays as it was.
         """
         began = time.perf_counter()
-        action = Action.of(action)
+        self._let_guess(False)
+        try:
+            self._take(Action.of(action), view, star, began)
+            self.solution = self._answer(began)
+        finally:
+            self._let_guess(True)
+        return self.solution
+
+    def _take(self, action: Action, view: View, star: Sequence[float] | None, began: float) -> None:
+        """Take in a step."""
         step = Step.of(view, star, f"step {len(self._steps)}")
         last = replace(self._steps[-1], action=action)
         self._check(action, last, step)
@@ -111,11 +139,16 @@ class OnlineMapper:
         self._steps[-1:] = [last, step]
         self._seen.append(observation(step, self.theory))
         if self._status is not Status.UNSATISFIABLE:
+            known = self._known()
             self._replay(action, step)
             if not self._settled() and len(self._steps) >= self._next_search:
                 self._ask()
-        self.solution = self._answer(began)
-        return self.solution
+            self._heed_guess()
+            if self._status is Status.UNKNOWN and self._limit is not None and has_frames(self.theory):
+                contradicted = known if not self._drafts else None
+                mended = contradicted is not None and self._mend(contradicted, began)
+                if not self._guess and not mended and (contradicted or len(self._steps) >= self._next_guess):
+                    self._begin_guess(contradicted)
 
     def _check(self, action: Action, last: Step, step: Step) -> None:
         """Whether a step fits the theory and the steps before."""
@@ -134,7 +167,9 @@ class OnlineMapper:
     def _replay(self, action: Action, step: Step) -> None:
         """Keep the maps that predict the step."""
         outcomes = [m.follow(action.name, self._seen[-1]) for m in self._maps]
+        lost = [m for m, outcome in zip(self._maps, outcomes, strict=True) if outcome is Outcome.UNKNOWN]
         self._maps = [m for m, outcome in zip(self._maps, outcomes, strict=True) if outcome is Outcome.PREDICTED]
+        self._drafts = [s for s in self._drafts if s.extend(action, step)]
         self._sketches = [s for s in self._sketches if s.extend(action, step)]
         self._complete = self._complete and Outcome.UNKNOWN not in outcomes
         if self.theory.without:
@@ -143,6 +178,62 @@ class OnlineMapper:
             if self._status is Status.OPTIMAL:
                 self._next_search = 0  # the cost was proven, so the next one may be
             self._status, self._complete = Status.UNKNOWN, False
+            for m in lost[:DRAFTS]:
+                self._draft(m.map(), len(self._steps) - 1)
+
+    def _draft(self, ssh_map: SSHMap, steps: int) -> None:
+        """Let a map of so many steps go on like a sketch, unless it contradicts the steps since."""
+        if self.theory.without:
+            return
+        sketch = Sketch.beyond(ssh_map, self.trace.prefix(steps), self.theory)
+        since = zip(self._steps[steps - 1 :], self._steps[steps:], strict=False)
+        if all(sketch.extend(before.action, step) for before, step in since if before.action):
+            self._drafts = sorted([*self._drafts, sketch], key=self._rank)[:DRAFTS]
+
+    def _known(self) -> SSHMap | None:
+        """The best map of the steps so far that is not a sketch of all of them."""
+        if self._maps:
+            return self._maps[0].map()
+        return self._drafts[0].map() if self._drafts else None
+
+    def _mend(self, ssh_map: SSHMap, began: float) -> bool:
+        """Let a map of fewer steps that the last ones contradict go on, with what does not fit as something new. False where there is no time for that."""
+        assert self._limit is not None
+        steps, begun = len(self._steps), time.perf_counter()
+        if begun - began + self._mending * steps**2 > self._limit:
+            return False
+        from ssh_abduction.framed import mended_map  # loads numpy
+
+        mended = mended_map(self.trace, self.theory, ssh_map, self._speedups)
+        self._mending = (time.perf_counter() - begun) / steps**2
+        if mended:
+            self._draft(mended, steps)
+        return True
+
+    def _rank(self, sketch: Sketch) -> tuple[int, ...]:
+        cost = Cost.of(sketch.map())
+        return tuple(getattr(cost, name) for name in self.theory.priorities)
+
+    def _let_guess(self, may_run: bool) -> None:
+        """Let a guess go on while the robot drives, and not where it would hold up a step."""
+        if self._guess:
+            self._guess.may_run.set() if may_run else self._guess.may_run.clear()
+
+    def _heed_guess(self) -> None:
+        """Take the map that came of a guess."""
+        if self._guess and self._guess.done():
+            guess, self._guess = self._guess, None
+            found = guess.map()
+            if found and self._status is Status.UNKNOWN:
+                self._draft(found, len(found.labels))
+
+    def _begin_guess(self, known: SSHMap | None) -> None:
+        """Begin a guess where no map is known to be minimal, or let a map that is contradicted be mended."""
+        from ssh_abduction.framed import MapGuess  # loads numpy
+
+        if not known:
+            self._next_guess = int(GUESS_AGAIN * len(self._steps))
+        self._guess = MapGuess.begun(self._steps, self.theory, self._speedups, known)
 
     def _settled(self) -> bool:
         """Whether clingo could add nothing."""
@@ -152,30 +243,28 @@ class OnlineMapper:
         """Let clingo say what the minimal maps are, or the best map it finds in time."""
         self.searches += 1
         known = self._maps[0].map() if self._status is Status.OPTIMAL else None
-        search = Search(self.trace, self.theory, limit=self._limit, maps=self._most, after=self._search, minimal=known)
+        search = Search(
+            self.trace, self.theory, limit=self._limit, maps=self._most, speedups=self._speedups, after=self._search, minimal=known
+        )
         found = tuple(search)
         self._search = search
         steps = len(self._steps)
         self._next_search = max(steps + PAUSE, int(RETRY * steps)) if search.stopped in ("time limit", "interrupted") else 0
         self._asked = search.solution()
-        cost = self._asked.cost
-        if search.status in (Status.OPTIMAL, Status.UNSATISFIABLE) or self._is_better(cost):
-            self._status, self._complete, self._cost = search.status, search.complete, cost
+        if search.status in (Status.OPTIMAL, Status.UNSATISFIABLE) or self.theory.without:
+            self._status, self._complete, self._cost = search.status, search.complete, self._asked.cost
+            self._drafts = []
             if len(found) >= len(self._maps) or known is None:
                 self._maps = [_Replayed(m, self._seen) for m in found]
-
-    def _is_better(self, cost: Cost | None) -> bool:
-        """Whether a map of this cost comes before the feasible one that we have."""
-        if cost is None or not self._maps or self._cost is None:
-            return cost is not None
-        return next((getattr(cost, c) < x for c in self.theory.priorities if (x := getattr(self._cost, c)) != getattr(cost, c)), False)
+        elif found:
+            self._draft(found[0], steps)
 
     def _answer(self, began: float) -> Solution:
         assert self._search is not None
         assert self._asked is not None
         status, cost, maps = self._status, self._cost, tuple(m.map() for m in self._maps)
-        if status is Status.UNKNOWN and self._sketches:
-            maps = (self._sketches[0].map(),)
+        if status is Status.UNKNOWN and (sketch := self._best_sketch()):
+            maps = (sketch.map(),)
             status, cost = Status.FEASIBLE, Cost.of(maps[0])
         last = self._asked
         asked = last.steps == len(self._steps)
@@ -192,6 +281,17 @@ class OnlineMapper:
             seconds=Seconds(time.perf_counter() - began, last.seconds.ground if asked else 0.0, last.seconds.solve if asked else 0.0),
             stopped=None if self._complete else self._search.stopped,
         )
+
+    def _best_sketch(self) -> Sketch | None:
+        """The best draft that the checker finds consistent, or else a sketch of all steps, if there is one."""
+        while self._drafts:
+            draft = self._drafts[0]
+            if not draft.certain:
+                draft.certain = not check(self.trace, draft.map(), self.theory)
+            if draft.certain:
+                return draft
+            del self._drafts[0]
+        return self._sketches[0] if self._sketches else None
 
 
 class _Replayed:

@@ -16,6 +16,10 @@ of the sides hold. Within a place the axioms of turns, courses and headings deci
 Where the way back looks otherwise than remembered, the travel goes to a new place. Where something remembered as known is later
 contradicted, the sketch is given up; one without `homing`, that never takes a place for one seen before unless next_place asks
 for it, may still do.
+
+A sketch may also begin with a map of some steps, and grow like a tree beyond it. What is new then lies on new streets, or on one known street, and
+contradicts nothing either. But a turn can be the first to show how two known streets cross, which then has to fit all their places; and without frames,
+a dstate that a turn leads to itself lies on no street: whether that fits, the sketch does not say.
 """
 
 from __future__ import annotations
@@ -26,7 +30,7 @@ from ssh_abduction.chart import QUARTERS
 from ssh_abduction.maps import DState, Path, SSHMap
 from ssh_abduction.replay import observation
 from ssh_abduction.theory import Theory
-from ssh_abduction.trace import Action, Step, View
+from ssh_abduction.trace import Action, Step, Trace, View
 
 
 class _Contradiction(Exception):  # noqa: N818 - not an error
@@ -47,7 +51,10 @@ class _State:
 
 
 class Sketch:
-    """A map of the steps so far, which grows with each."""
+    """A map of the steps so far, which grows with each.
+
+    certain  whether the map is known to be consistent; if not, it is to be checked, and this to be set
+    """
 
     def __init__(self, first: Step, theory: Theory, homing: bool = True) -> None:
         self.labels: list[int] = []
@@ -61,10 +68,42 @@ class Sketch:
         self._along: dict[tuple[int, int, int], int] = {}  # place, path, direction: dstate
         self._facing: dict[tuple[int, int], int] = {}  # place, heading: dstate, where places have frames
         self._slots: dict[tuple[int, int], tuple[int, int]] = {}  # place, heading: path, direction, where places have frames
+        self._excused: tuple[tuple[int, int], ...] = ()  # pairs of paths
         self._map: SSHMap | None = None
+        self._tree = self.certain = True
         self.labels.append(self._new_place(first))
         if theory.all_on_paths and theory.level == "topological":
             self._find_course(0)
+
+    @classmethod
+    def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Sketch:
+        """A sketch that begins with a map of a trace, of a theory with all its axioms."""
+        sketch = cls(trace.steps[0], theory)
+        sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.labels)
+        sketch._links = {(s, action): x for s, action, x in ssh_map.links}
+        sketch._excused = ssh_map.excused
+        sketch._orders = [list(path.order) for path in ssh_map.paths]
+        sketch._states, sketch._along, sketch._facing, sketch._slots = [], {}, {}, {}
+        stars: dict[int, object] = {}
+        seen = dict(zip(reversed(ssh_map.labels), reversed(trace.steps), strict=True))
+        for s in ssh_map.dstates:
+            place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
+            sketch._states.append(_State(s.view, observation(seen[s.id], theory), place, heading, s.path, direction))
+            stars.setdefault(place, sketch._star(seen[s.id], heading))
+            if s.path is not None:
+                sketch._along[place, s.path, direction] = s.id
+            if sketch._framed:
+                sketch._facing[place, heading] = s.id
+            if sketch._framed and s.path is not None:
+                sketch._slots[place, heading] = s.path, direction
+                sketch._slots[place, (heading + 2) % 4] = s.path, -direction
+        sketch._stars = [stars[place] for place in sorted(stars)]
+        turns = {action.name: action.turn for action in trace.actions}
+        for here, action, there in ssh_map.links:
+            if turns[action] == "around":
+                sketch._states[here].reverse.append(there)
+                sketch._states[there].reverse.append(here)
+        return sketch
 
     def extend(self, action: Action, step: Step) -> bool:
         """Go on with an action and what was seen then. False where that contradicts the sketch, which is of no use from then on."""
@@ -109,6 +148,8 @@ class Sketch:
             there = self._new(step, s.place, heading)
         if around:
             self._turned_around(here, there)
+        elif s.path is not None and self._states[there].path is not None:
+            self._doubt()
         if self._theory.all_on_paths:
             self._find_course(there)
         return there
@@ -119,6 +160,7 @@ class Sketch:
         self._states[there].reverse.append(here)
         for s in (self._states[here], self._states[there]):
             if s.path is not None:
+                self._doubt()
                 for x in s.reverse:
                     self._set_course(x, s.path, -s.direction)
 
@@ -150,6 +192,8 @@ class Sketch:
             there = self._new(step, place, heading)
         elif self._states[there].seen != observation(step, self._theory):
             return None
+        else:
+            self._doubt()
         self._set_course(there, path, direction)
         return there
 
@@ -158,11 +202,17 @@ class Sketch:
         s = self._states[here]
         if s.path is None:
             path, direction = self._slots.get((s.place, s.heading), (len(self._orders), 1))  # without frames there are no slots
+            if path < len(self._orders) or not self._framed:
+                self._doubt()
             if path == len(self._orders):
                 self._orders.append([s.place])
             self._set_course(here, path, direction)
             return path, direction
         return s.path, s.direction
+
+    def _doubt(self) -> None:
+        """What was done may be the first to join two streets that the map knew."""
+        self.certain = self._tree
 
     def _set_course(self, here: int, path: int, direction: int) -> None:
         """Give a dstate its course, and in reverse those that a turn around links it to."""
@@ -224,4 +274,5 @@ class Sketch:
             for i, s in enumerate(self._states)
         )
         paths = tuple(Path(number, tuple(self._orders[path][::direction])) for path, (number, direction) in first.items())
-        return SSHMap(labels, dstates, links, tuple(range(len(self._stars))), paths)
+        excused = [sorted((first[h][0], first[g][0])) for h, g in self._excused]
+        return SSHMap(labels, dstates, links, tuple(range(len(self._stars))), paths, tuple(sorted((h, g) for h, g in excused)))

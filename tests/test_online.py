@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+from unittest.mock import patch
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from instances import maze
 from strategies import theories, traces
 from worlds import TOURS, drive, rectangle
 
-from ssh_abduction import Action, OnlineMapper, Solution, Status, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction import Action, OnlineMapper, Solution, Status, Theory, TheoryError, Trace, TraceError, framed, online, solve
+from ssh_abduction.chart import Chart
 from ssh_abduction.checker import check
+from ssh_abduction.replay import Log
 from ssh_abduction.sketch import Sketch
+from ssh_abduction.speedups import Speedups
 
 NO_TIME = 1e-9  # seconds: every search is stopped before it begins
 
@@ -96,6 +106,45 @@ def test_sketches_are_consistent(data: st.DataObject) -> None:
     assert check(trace, sketch.map(), theory) == ()
 
 
+def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
+    """A minimal map of so many steps goes on beyond them. After each step it is consistent, as it says; returns where it did not say so."""
+    maps = solve(trace.prefix(known), theory, maps=5).maps
+    if not maps:
+        return []
+    sketch = Sketch.beyond(maps[which % len(maps)], trace.prefix(known), theory)
+    assert sketch.map() == maps[which % len(maps)]
+    doubts = []
+    for i in range(known, len(trace)):
+        before = trace.actions[i - 1]
+        if not sketch.extend(before, trace.steps[i]):
+            break
+        consistent = check(trace.prefix(i + 1), sketch.map(), theory) == ()
+        assert consistent or not sketch.certain
+        doubts.append(not sketch.certain)
+        if not consistent:
+            break
+        sketch.certain = True
+    return doubts
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(st.data())
+def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> None:
+    trace = data.draw(traces(max_steps=10), label="trace")
+    theory = data.draw(theories(trace), label="theory").resolve(trace)
+    draft(trace, theory, data.draw(st.integers(1, len(trace)), label="known"), data.draw(st.integers(0, 4), label="which"))
+
+
+@pytest.mark.parametrize("stars", [False, True])
+def test_a_map_goes_on_through_a_maze(stars: bool) -> None:
+    doubts: list[bool] = []
+    for seed in range(12):
+        trace = maze(3, 3, steps=90, seed=seed, loops=0.5, stars=True).trace
+        trace = trace if stars else Trace.from_steps([step.view or "" for step in trace], trace.actions)
+        doubts += draft(trace, Theory.topological().resolve(trace), 12 + 4 * seed if stars else 6 + seed, seed)
+    assert {*doubts} == {True, False}
+
+
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(st.data())
 def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) -> None:
@@ -135,6 +184,89 @@ def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
         bound = answer.bound.dstates
     assert mapper.solution.status is Status.FEASIBLE
     assert mapper.searches <= half + (len(trace) - half) // 2 + 1  # not one a step
+
+
+def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
+    rest = trace.steps[len(mapper.trace) :]
+    return [
+        mapper.observe(action, step.view or "", star=step.star)
+        for action, step in zip(trace.actions[len(mapper.trace) - 1 :], rest, strict=True)
+    ]
+
+
+def test_maps_are_guessed_while_the_robot_drives() -> None:
+    """Without time for clingo. The guess is made for some of the steps; its map goes on."""
+    walk = maze(4, 4, steps=220, seed=1, stars=True)
+    trace = walk.trace
+    with patch.object(framed, "has_processors", lambda _: True), patch.object(online, "GUESSED", 200):
+        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, limit=NO_TIME)
+        explore(trace.prefix(205), mapper)
+        assert mapper._guess is not None
+        assert mapper._guess.map() is not None  # waits for it
+        answers = explore(trace, mapper)
+    for i, answer in enumerate(answers, 206):
+        assert answer.status is Status.FEASIBLE
+        assert check(trace.prefix(i), answer.maps[0], mapper.theory) == ()
+    assert len(answers[0].maps[0].dstates) <= 1.2 * len(set(walk.truth)) < len(mapper._sketches[0].map().dstates)
+
+
+def test_a_map_that_is_contradicted_is_mended() -> None:
+    """Maps of fewer steps, kept as far as can be: what does not fit is new. That has streets mostly."""
+    without = contradicted = 0
+    for seed in range(10):
+        trace = maze(3, 3, steps=120, seed=seed, stars=True).trace
+        theory = Theory.topological().resolve(trace)
+        first = 25 + 5 * seed
+        known = solve(trace.prefix(first), theory, maps=1).maps[0]
+        predicted = Log(trace, theory).replay(known.labels).labels
+        for steps in (min(len(predicted), len(trace)), min(len(predicted) + 1, len(trace)), min(len(predicted) + 20, len(trace))):
+            found = framed.mended_map(trace.prefix(steps), theory, known, Speedups())
+            if found is None:
+                without += 1
+                continue
+            assert check(trace.prefix(steps), found, theory) == ()
+            if steps == len(predicted):
+                assert found.labels == predicted
+            contradicted += len(found.dstates) > len(known.dstates)
+            assert len(found.dstates) < len(Chart.framed(trace.prefix(steps), Log(trace.prefix(steps), theory)).seen)
+    assert without < 5 < contradicted
+
+
+@pytest.mark.parametrize("off", ["annealed", "threads"])
+def test_nothing_is_guessed_where_that_is_switched_off(off: str) -> None:
+    trace = maze(2, 2, steps=60, seed=0, stars=True).trace
+    with patch.object(online, "GUESSED", 10):
+        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, limit=NO_TIME, speedups=Speedups.without(off))
+        explore(trace, mapper)
+    assert mapper._guess is None
+
+
+def test_a_guess_ends_with_its_mapper_and_with_the_program() -> None:
+    program = """
+import threading
+from instances import maze
+from ssh_abduction import OnlineMapper, framed
+framed.has_processors = lambda _: True
+
+def begun():
+    trace = maze(10, 10, steps=150, seed=1, stars=True).trace
+    mapper = OnlineMapper(trace.steps[0].view, star=trace.steps[0].star, limit=1e-9)
+    for action, step in zip(trace.actions, trace.steps[1:]):
+        mapper.observe(action, step.view, star=step.star)
+    return mapper
+
+mapper = begun()
+assert threading.active_count() == 2
+del mapper
+assert threading.active_count() == 1
+mapper = begun()
+assert mapper._guess and not mapper._guess.done()
+"""
+    folder = Path(__file__).parent.parent / "benchmarks"
+    done = subprocess.run(
+        [sys.executable, "-c", program], check=False, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
 
 
 def test_what_cannot_be_leaves_no_map() -> None:
