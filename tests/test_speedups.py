@@ -38,7 +38,7 @@ def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
     return Trace.from_steps(seen, [("travel", "right")[action] for action in done])
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(machines(), st.sets(st.sampled_from(NAMES)), st.data())
 def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trace, off: set[str], data: st.DataObject) -> None:
     """With prefixes, patience and what is held back so small that all of it happens on short traces."""
