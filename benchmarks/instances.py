@@ -24,11 +24,12 @@ class Walk:
     truth: tuple[object, ...]
 
 
-def maze(width: int, height: int, *, steps: int, seed: int, loops: float = 0.1, stars: bool = False) -> Walk:
+def maze(width: int, height: int, *, steps: int, seed: int, loops: float = 0.1, stars: bool = False, follow: bool = False) -> Walk:
     """A random walk of so many actions in a maze of corridors: a random spanning tree of the grid, and each further wall open by chance.
 
     A state is a cell and a heading, a view the openings ahead, right, back and left. Where the way ahead is open the robot
-    travels half of the time; else it turns. It turns around only where it cannot travel.
+    travels half of the time; else it turns. It turns around only where it cannot travel. One that follows corridors travels in four of six cases
+    where it can; else it turns to where the way is open to its right or left, and around only in a dead end.
     """
     chance = random.Random(seed)
     walls = [((x, y), (x + dx, y + dy)) for x in range(width) for y in range(height) for dx, dy in ((1, 0), (0, 1))]
@@ -60,7 +61,13 @@ def maze(width: int, height: int, *, steps: int, seed: int, loops: float = 0.1, 
         truth.append((x, y, heading))
         if step == steps:
             break
-        action = chance.choice(["travel", "travel", "right", "left"] if seen[-1][0] else ["right", "left", "around"])
+        ahead_open, right_open, _, left_open = seen[-1]
+        if not follow:
+            action = chance.choice(["travel", "travel", "right", "left"] if ahead_open else ["right", "left", "around"])
+        elif ahead_open:
+            action = chance.choice(["travel"] * 4 + ["right", "left"])
+        else:
+            action = chance.choice(["right"] * right_open + ["left"] * left_open or ["around"])
         if action == "travel":
             x, y = ahead(x, y, heading)
         else:
