@@ -203,8 +203,9 @@ class FramedEngine(SameEngine):
             self._chart = self._charted(len(self._trace))
         except NoFrame:
             return None
-        labels = self._guessed_labels(self._chart, self._watch.check)
-        return next(self._streets(_Naming(labels, self._street_control(labels, single=True)), "ignore"), None)
+        if len(self._chart.fits()) > GUESSABLE:
+            return None
+        return self._single_streets(self._guessed_labels(self._chart, self._watch.check))
 
     def mended(self, known: Sequence[int]) -> Found | None:
         """A map of the whole trace in which the first steps keep these dstates, as far as can be, and all else is new, if that has streets."""
@@ -212,8 +213,7 @@ class FramedEngine(SameEngine):
         guess = [-1] * len(chart.seen)
         for node, label in zip(chart.node_of, known, strict=False):
             guess[node] = label
-        labels = kept(chart.apart(len(chart.seen)), chart.links, guess)
-        return next(self._streets(_Naming(labels, self._street_control(labels, single=True)), "ignore"), None)
+        return self._single_streets(kept(chart.apart(len(chart.seen)), chart.links, guess))
 
     def _has_single_streets(self, chart: FramedChart, labels: Sequence[int]) -> bool:
         return bool(self._settled_streets(chart, labels, single=True).solve().satisfiable)
@@ -336,12 +336,16 @@ class FramedEngine(SameEngine):
         """
         naming = _Naming(list(labels), None)
         if len(set(labels)) > MANY_DSTATES:
-            single = replace(naming, control=self._street_control(labels, single=True))
-            found = next(self._streets(single, "ignore"), None)
+            found = self._single_streets(labels)
             if found is not None:
                 return found, naming
         naming = replace(naming, control=self._street_control(labels))
         return next(self._streets(naming, "ignore"), None), naming
+
+    def _single_streets(self, labels: Sequence[int]) -> Found | None:
+        """A map with these dstates in which no two places or stretches are taken for one, unless they have to be; if there is one."""
+        naming = _Naming(list(labels), self._street_control(labels, single=True))
+        return next(self._streets(naming, "ignore"), None)
 
     def _better_streets(self, naming: _Naming) -> Iterator[Found]:
         """Maps with these dstates, each as good as the one before or better, the last one best; none if no streets fit them.

@@ -43,6 +43,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.checker import check
+from ssh_abduction.engine import AT_ONCE
 from ssh_abduction.errors import TraceError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.replay import Outcome, observation
@@ -139,12 +140,12 @@ class OnlineMapper:
         self._steps[-1:] = [last, step]
         self._seen.append(observation(step, self.theory))
         if self._status is not Status.UNSATISFIABLE:
-            known = self._known()
+            known = self.solution.maps[0] if self._maps or self._drafts else None
             self._replay(action, step)
             if not self._settled() and len(self._steps) >= self._next_search:
                 self._ask()
             self._heed_guess()
-            if self._status is Status.UNKNOWN and self._limit is not None and has_frames(self.theory):
+            if self._may_guess():
                 contradicted = known if not self._drafts else None
                 mended = contradicted is not None and self._mend(contradicted, began)
                 if not self._guess and not mended and (contradicted or len(self._steps) >= self._next_guess):
@@ -190,22 +191,16 @@ class OnlineMapper:
         if all(sketch.extend(before.action, step) for before, step in since if before.action):
             self._drafts = sorted([*self._drafts, sketch], key=self._rank)[:DRAFTS]
 
-    def _known(self) -> SSHMap | None:
-        """The best map of the steps so far that is not a sketch of all of them."""
-        if self._maps:
-            return self._maps[0].map()
-        return self._drafts[0].map() if self._drafts else None
-
     def _mend(self, ssh_map: SSHMap, began: float) -> bool:
         """Let a map of fewer steps that the last ones contradict go on, with what does not fit as something new. False where there is no time for that."""
         assert self._limit is not None
-        steps, begun = len(self._steps), time.perf_counter()
-        if begun - began + self._mending * steps**2 > self._limit:
+        steps, now = len(self._steps), time.perf_counter()
+        if now - began + self._mending * steps**2 > self._limit:
             return False
         from ssh_abduction.framed import mended_map  # loads numpy
 
         mended = mended_map(self.trace, self.theory, ssh_map, self._speedups)
-        self._mending = (time.perf_counter() - begun) / steps**2
+        self._mending = (time.perf_counter() - now) / steps**2
         if mended:
             self._draft(mended, steps)
         return True
@@ -216,8 +211,14 @@ class OnlineMapper:
 
     def _let_guess(self, may_run: bool) -> None:
         """Let a guess go on while the robot drives, and not where it would hold up a step."""
-        if self._guess:
-            self._guess.may_run.set() if may_run else self._guess.may_run.clear()
+        if self._guess and may_run:
+            self._guess.may_run.set()
+        elif self._guess:
+            self._guess.may_run.clear()
+
+    def _may_guess(self) -> bool:
+        """Whether a small map is wanted, and the steps are not too many to be compared in pairs."""
+        return self._status is Status.UNKNOWN and self._limit is not None and has_frames(self.theory) and len(self._steps) <= AT_ONCE
 
     def _heed_guess(self) -> None:
         """Take the map that came of a guess."""
