@@ -84,22 +84,15 @@ class Chart:
         A guess: the causal theory does not say that turns rotate. Raises NoFrame where some action is neither turn nor travel, or where
         what is seen after a turn does not follow from what was seen before.
         """
-        right: dict[int, int] = {}  # by what is seen, what is seen after a turn right
-        for action, before, after in zip(trace.actions[: size - 1], log.seen, log.seen[1:], strict=False):
+        after: dict[tuple[int, int], int] = {}  # what is seen, and quarters to the right: what is seen then
+        for action, before, then in zip(trace.actions[: size - 1], log.seen, log.seen[1:], strict=False):
             if action.kind is None:
                 raise NoFrame
-            if action.turn in ("right", "left"):
-                seen, then = (before, after) if action.turn == "right" else (after, before)
-                if right.setdefault(seen, then) != then:
+            if action.turn:
+                quarters = QUARTERS[action.turn]
+                if after.setdefault((before, quarters), then) != then or after.setdefault((then, 4 - quarters), before) != before:
                     raise NoFrame
-        around = {}
-        for seen in dict.fromkeys(log.seen[:size]):
-            views = [seen]
-            while len(views) < 5:
-                views.append(right.get(views[-1], -1))
-            if -1 in views or views.pop() != seen:
-                raise NoFrame
-            around[seen] = views
+        around = {seen: _around(seen, after) for seen in dict.fromkeys(log.seen[:size])}
         return Chart.framed(trace, log, size, around)
 
     @staticmethod
@@ -227,3 +220,25 @@ def numbered(labels: Iterable[Hashable]) -> list[int]:
     """Labels, numbered by the first step at each."""
     number: dict[Hashable, int] = {}
     return [number.setdefault(label, len(number)) for label in labels]
+
+
+def _around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int]:
+    """What is seen ahead, right, back and left where this is seen ahead. Raises NoFrame.
+
+    after  what is seen after a turn, by what was seen before and quarters to the right
+    """
+    views = {0: seen}
+    waiting = [0]
+    while waiting:
+        here = waiting.pop()
+        for quarters in QUARTERS.values():
+            there = (here + quarters) % 4
+            if (then := after.get((views[here], quarters))) is None:
+                continue
+            if there not in views:
+                waiting.append(there)
+            if views.setdefault(there, then) != then:
+                raise NoFrame
+    if len(views) < 4:
+        raise NoFrame
+    return [views[slot] for slot in range(4)]

@@ -181,3 +181,11 @@ def test_a_chart_of_what_is_seen_around() -> None:
     chart = Chart.turned(trace, Log(trace, CAUSAL), 4)
     assert chart.stars == ((0, 1, 0, 1), (0, 1, 0, 1))
     assert chart.node_of == (0, 1, 2, 3)
+
+
+def test_what_turns_of_any_kind_show_is_put_together() -> None:
+    """Nobody turned to the right of what is behind, nor to what is behind from the left."""
+    trace = Trace.from_steps("abadaca", ["right", "left", "left", "right", "travel", "around"])
+    chart = Chart.turned(trace, Log(trace, CAUSAL), 7)
+    a, b, d, c = range(4)  # by first step
+    assert chart.stars == ((a, b, c, d), (c, d, a, b))

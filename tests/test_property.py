@@ -38,7 +38,7 @@ def agree(trace: Trace, theory: Theory) -> None:
         assert getattr(solution.cost, name) == getattr(counts, name)
 
 
-@settings(max_examples=1000, deadline=None, derandomize=True)
+@settings(max_examples=600, deadline=None, derandomize=True)
 @given(st.data())
 def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
