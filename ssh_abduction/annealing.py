@@ -19,21 +19,23 @@ made back is not an axiom, but counts as if it had been seen.
 
 Names of places are as in `named.py`: visits that are pairwise apart are places of their own, and each kind of place has spare names.
 There have to be many: places that fall together where names are short do not come apart later.
+
+A causal trace of other actions than turns and travels is annealed in the same way: each step is a visit, to a place at which the robot stands in one way.
 """
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count, pairwise
+from itertools import chain, count, pairwise, repeat
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.apart import clique
-from ssh_abduction.chart import FramedChart, numbered
+from ssh_abduction.chart import Chart, FramedChart, numbered
 
 SPARES = 6  # spare names for places of a kind, as many more after two attempts, and more where names would have more than so many
 VISITS = 12  # visits each
@@ -44,6 +46,9 @@ ANNEALED = ((0.5, 1500),)
 # The same, and how many visits each name has, where a rough guess will do: one of so many travels may lead elsewhere.
 FEW = 200
 ROUGH, ROUGH_VISITS = ((0.6, 300), *10 * ((0.75, 150),)), 40
+# And where each step is a visit; the last again and again, until whoever asks is content.
+STEPS = (0.75, 1500), (0.75, 500)
+ENTRIES = 60_000_000  # of the table of transitions, that are looked up for all steps in one go: 12 bytes each
 SECONDS = 10.0  # after which there is no other attempt
 COLD = 0.95  # to what power in the last of them
 LAST, QUENCHED = 50, 4.0  # sweeps at the end, so that little is left to chance, and to what power then
@@ -101,45 +106,73 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, ro
 
 def attempts(chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False) -> Iterator[tuple[int, Guess]]:
     """Guesses without end, each with how many travels do not lead where most such travels do. Parameters as above."""
+    leaves = list(chart.leaves.values())
     for attempt in count(1):
-        drawn = _Drawn(chart, SPARES * ((attempt + 1) // 2), ROUGH_VISITS if rough else VISITS, np.random.default_rng(attempt))
+        options = _options(chart, SPARES * ((attempt + 1) // 2), ROUGH_VISITS if rough else VISITS)
+        drawn = _Drawn(options, leaves, 4, np.random.default_rng(attempt))
         for first, sweeps in ROUGH if rough else ANNEALED:
-            for sweep in range(sweeps + LAST):
-                check()
-                power = first + (COLD - first) * sweep / sweeps if sweep < sweeps else QUENCHED
-                if sweep % ROUND == 0:
-                    drawn.choose(power)
-                drawn.sweep(power)
-            yield drawn.failed(), drawn.guess()
+            drawn.anneal(first, sweeps, check)
+            yield drawn.failed(), Guess(drawn.labels, drawn.sure())
+
+
+def annealed_steps(
+    chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None] = lambda: None
+) -> Iterator[list[int]]:
+    """Guesses without end at the dstates of all steps, as labels; -1 where a guess is not sure. They become better. None where that takes too much memory.
+
+    clique  steps that are pairwise apart
+    may_be  of each step, the numbers of those of the clique that it may be one with
+    check   called now and then, and may raise
+    """
+    options = _step_options(chart, clique, may_be)
+    if options.size * options.shape[1] > ENTRIES:
+        return
+    drawn = _Drawn(options, [(0, action) for _, action, _ in chart.links], 1, np.random.default_rng(0))
+    for first, sweeps in chain(STEPS, repeat(STEPS[-1])):
+        drawn.anneal(first, sweeps, check)
+        yield np.where(drawn.sure(), drawn.labels, -1).tolist()
 
 
 class _Drawn:
     """States of all visits, drawn again and again."""
 
-    def __init__(self, chart: FramedChart, spares: int, visits: int, random: np.random.Generator) -> None:
+    def __init__(self, options: States, leaves: Sequence[tuple[int, int]], ways: int, random: np.random.Generator) -> None:
+        """
+        options  visits x states that are possible; -1 where there are fewer
+        leaves   the slot that each visit but the last ends at, and the action there
+        ways     to stand at a place, each a state: one, or four, of which the last two face back where the first two face ahead
+        """
         self._random = random
-        self._visits = np.arange(len(chart.stars))
-        leaves = [chart.leaves[visit] for visit in self._visits[:-1].tolist()]
+        self._options = options
+        self._visits = np.arange(len(options))
         actions = {action: number for number, action in enumerate(dict.fromkeys(action for _, action in leaves))}
         self._actions = max(1, len(actions))
         self._slot = np.array([slot for slot, _ in leaves], dtype=int)
         self._action = np.array([actions[action] for _, action in leaves], dtype=int)
-        self._options = _options(chart, spares, visits)  # visits x states that are possible; -1 where there are fewer
-        self._states = 4 * (int(self._options.max()) // 4 + 1)
-        states = np.arange(self._states)
-        self._back = states ^ 2  # of each state, the one that faces the other way
-        counts = (self._options >= 0).sum(axis=1)
-        self._labels = self._options[self._visits, (random.random(len(counts)) * counts).astype(int)]
+        self._ways = ways
+        self._states = ways * (int(options.max()) // ways + 1)
+        self._back = np.arange(self._states) ^ 2  # of each state, the one that faces the other way
+        counts = (options >= 0).sum(axis=1)
+        self.labels = options[self._visits, (random.random(len(counts)) * counts).astype(int)]
         self._count()
 
-    def guess(self) -> Guess:
-        """The states drawn last. Visits that a travel joins are not sure, if most such travels lead elsewhere."""
-        rows = self._rows(self._labels[:-1], self._visits[:-1])
-        odd = self._counts[rows, self._labels[1:]] < self._counts[rows].max(axis=1)
+    def anneal(self, first: float, sweeps: int, check: Callable[[], None]) -> None:
+        """So many sweeps, while probabilities are taken to higher powers from this one on; and a few more in the end."""
+        for sweep in range(sweeps + LAST):
+            check()
+            power = first + (COLD - first) * sweep / sweeps if sweep < sweeps else QUENCHED
+            if sweep % ROUND == 0:
+                self._choose(power)
+            self._sweep(power)
+
+    def sure(self) -> NDArray[np.bool_]:
+        """Of each visit, whether it was drawn last where the actions to it and from it mostly led."""
+        rows = self._rows(self.labels[:-1], self._visits[:-1])
+        odd = self._counts[rows, self.labels[1:]] < self._counts[rows].max(axis=1)
         sure = np.ones(len(self._visits), dtype=bool)
         sure[:-1] &= ~odd
         sure[1:] &= ~odd
-        return Guess(self._labels, sure)
+        return sure
 
     def failed(self) -> int:
         """How many travels do not lead where most travels of the same state and action do."""
@@ -147,14 +180,17 @@ class _Drawn:
 
     def _rows(self, states: States, visits: States) -> States:
         """The number of what is done in these states, by state and action, at the end of these visits."""
-        rows: States = (states - states % 4 + (states + self._slot[visits]) % 4) * self._actions + self._action[visits]
+        turned = (states + self._slot[visits]) % self._ways
+        rows: States = (states - states % self._ways + turned) * self._actions + self._action[visits]
         return rows
 
     def _count(self) -> None:
-        here, there = self._labels[:-1], self._labels[1:]
+        here, there = self.labels[:-1], self.labels[1:]
         rows = self._rows(here, self._visits[:-1])
-        back = self._back[there] * self._actions + self._action
-        entries = np.concatenate([rows * self._states + there, back * self._states + self._back[rows // self._actions]])
+        entries = rows * self._states + there
+        if self._ways > 1:
+            back = self._back[there] * self._actions + self._action
+            entries = np.concatenate([entries, back * self._states + self._back[rows // self._actions]])
         self._counted = entries
         shape = self._states * self._actions, self._states
         self._counts = np.bincount(entries, minlength=shape[0] * shape[1]).reshape(shape).astype(np.float32)
@@ -178,10 +214,10 @@ class _Drawn:
         table[row, column] = np.power((self._counts[row, column] + np.float32(WEIGHT)) / totals[row], np.float32(power))
         return table.ravel()[entries]
 
-    def choose(self, power: float) -> None:
+    def _choose(self, power: float) -> None:
         """Choose the states that visits are drawn from: at random, the likely ones sooner, and the last one drawn for sure."""
         likely = self._transitions(self._entries(self._options), power)
-        place = (self._options == self._labels[:, None]).argmax(axis=1)
+        place = (self._options == self.labels[:, None]).argmax(axis=1)
         starts, lengths = self._stretches(0)
         ahead = self._filtered(self._options, likely, place, starts, lengths)
         behind = np.ones_like(ahead)
@@ -199,10 +235,10 @@ class _Drawn:
         few = min(LIKELY, rank.shape[1])
         chosen = np.argpartition(-rank, few - 1, axis=1)[:, :few]
         self._chosen = np.take_along_axis(self._options, chosen, axis=1)
-        self._place = (self._chosen == self._labels[:, None]).argmax(axis=1)
+        self._place = (self._chosen == self.labels[:, None]).argmax(axis=1)
         self._chosen_entries = self._entries(self._chosen)
 
-    def sweep(self, power: float) -> None:
+    def _sweep(self, power: float) -> None:
         """Draw the states of all visits, stretch by stretch."""
         likely = self._transitions(self._chosen_entries, power)
         starts, lengths = self._stretches(int(self._random.integers(STRETCH)))
@@ -218,7 +254,7 @@ class _Drawn:
             drawn = (sums < self._random.random((len(visits), 1)) * sums[:, -1:]).sum(axis=1)
             place[visits] = np.minimum(drawn, sums.shape[1] - 1)
         self._place = place
-        self._labels = self._chosen[self._visits, place]
+        self.labels = self._chosen[self._visits, place]
         self._count()
 
     def _stretches(self, first: int) -> tuple[States, States]:
@@ -258,6 +294,22 @@ def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
     options: list[list[int]] = [np.flatnonzero(row).tolist() for row in known]
     for visit in set(range(len(kinds))).difference(pinned):
         options[visit] += [4 * place + r for place in spare[kinds[visit]] for r in range(4) if turned[visit][r] == kinds[visit]]
+    return _padded(options)
+
+
+def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]]) -> States:
+    """The states that each step may be in: those of the clique, and spare ones for each view."""
+    pinned = set(clique)
+    named = Counter(chart.seen[step] for step in clique)
+    spare: dict[int, range] = {}
+    names = len(clique)
+    for view, steps in Counter(chart.seen).items():
+        spare[view] = range(names, names + SPARES + max(0, steps // ROUGH_VISITS - named[view]))
+        names = spare[view].stop
+    return _padded([[*options, *(() if step in pinned else spare[chart.seen[step]])] for step, options in enumerate(may_be)])
+
+
+def _padded(options: Sequence[Sequence[int]]) -> States:
     padded = np.full((len(options), max(map(len, options))), -1)
     for visit, states in enumerate(options):
         padded[visit, : len(states)] = states

@@ -169,11 +169,12 @@ class FramedEngine(SameEngine):
             far=None,
         )
 
-        def guessed() -> list[int]:
-            self._guess = self._guessed_labels(chart, watch.check)
-            return self._guess
+        self._beside = Beside(self._named, watch, self._small_maps(self._named, chart, watch.check))
 
-        self._beside = Beside(self._named, watch, guessed)
+    def _small_maps(self, named: NearbyEngine, chart: FramedChart, check: Callable[[], None]) -> Iterator[list[int]]:
+        """Labels, each time fewer, of maps of the causal axioms near a guess."""
+        self._guess = self._guessed_labels(chart, check)
+        yield from named.fewer(self._guess)
 
     def _guessed_labels(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
         """Labels of a map of the causal axioms: one that has streets, as far as single streets tell, or where that is not soon found one of few dstates."""

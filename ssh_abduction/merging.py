@@ -1,7 +1,8 @@
 """A small map of the causal theory without a search: steps are merged where much speaks for it, in the order of how much.
 
+>>> from ssh_abduction.apart import apartness
 >>> from ssh_abduction.merging import merged
->>> merged([0, 1, 0, 1], [0, 0, 0], [0, 1])
+>>> merged(apartness([0, 1, 0, 1], [0, 0, 0]), [(0, 0, 1), (1, 0, 2), (2, 0, 3)], [0, 1])
 [0, 1, 0, 1]
 
 Steps that are apart are known dstates to begin with. To merge two steps means to merge what the same actions lead to from them, and so on:
@@ -10,6 +11,7 @@ the *evidence* is how many merges that makes, and how often it confirms one made
 evidence, go first; then those with less, or with rivals that have clearly less. A step that fits none is a new dstate.
 
 What is guessed at can be finished in the same way: nodes that a guess has at one dstate are known to begin with, as far as they can be one.
+And the dstates of a map are thinned so: those seen least are merged with others, as long as that leaves a map.
 
 This is evidence-driven state merging (Lang, Pearlmutter, Price 1998, "Results of the Abbadingo One DFA Learning Competition") for one
 trace, from known dstates all over it rather than from a root.
@@ -23,7 +25,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.apart import Matrix, apartness
+from ssh_abduction.apart import Matrix
 from ssh_abduction.chart import numbered
 
 # Least evidence for a merge, and how much it has to be ahead of the next; among how many known dstates at most:
@@ -33,14 +35,15 @@ Link: TypeAlias = tuple[int, int, int]  # node, action, node
 Told: TypeAlias = tuple[Matrix, Sequence[tuple[int, int]]]  # which nodes are apart, and pairs that are one
 
 
-def merged(seen: Sequence[int], actions: Sequence[int], clique: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
-    """The dstate of each step in some map, numbered by first visit.
+def merged(apart: Matrix, links: Iterable[Link], clique: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
+    """The dstate of each node of a chart in some map, numbered by first node.
 
-    seen, actions  what is seen at each step, and done after each but the last
-    clique         steps that are pairwise apart
-    check          called now and then; may raise
+    apart   which nodes are apart, nodes x nodes
+    links   of the chart
+    clique  nodes that are pairwise apart
+    check   called now and then; may raise
     """
-    classes = _Classes(apartness(seen, actions), [(t, action, t + 1) for t, action in enumerate(actions)], clique)
+    classes = _Classes(apart.copy(), links, clique)
     classes.settle_all(check)
     return classes.labels()
 
@@ -52,13 +55,10 @@ def merged_near(
     tell: Callable[[Sequence[int], Sequence[int]], Told | None] | None = None,
     check: Callable[[], None] = lambda: None,
 ) -> list[int] | None:
-    """The dstate of each node of a chart in some map near a guess, numbered by first node. None where what is told rules that out.
+    """The same near a guess. None where what is told rules that out.
 
-    apart  which nodes are apart, nodes x nodes
-    links  of the chart
     guess  a label of each node; -1 where it is not known. Nodes that cannot be at one dstate with the others of their label leave it
     tell   is asked what follows from labels of all nodes, some of which are still open, whenever these have changed; None: they contradict
-    check  called now and then; may raise
     """
     classes = _guessed(apart, links, guess)
     agrees = classes.settle_all(check, lambda: not tell or classes.heed(tell(classes.labels(), classes.unsettled().tolist())))
@@ -68,6 +68,19 @@ def merged_near(
 def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int]:
     """The same where nothing is merged but what has to be: what is not known, or leaves its label, is something new."""
     return _guessed(apart, links, guess).labels()
+
+
+def thinned(apart: Matrix, links: Iterable[Link], labels: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
+    """The dstate of each node in a map where no two dstates of this one are left that could be one.
+
+    Those seen at the fewest nodes are merged first, each with that for which the evidence is most. Parameters as above; the labels are those of a map.
+    """
+    classes = _guessed(apart, links, labels)
+    for root in sorted(np.flatnonzero(classes.known).tolist(), key=np.bincount(classes.root).tolist().__getitem__):
+        check()
+        if classes.known[root]:  # still
+            classes.thin(root)
+    return classes.labels()
 
 
 def _guessed(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> _Classes:
@@ -156,6 +169,12 @@ class _Classes:
             settled += 1
         return settled
 
+    def thin(self, root: int) -> None:
+        """Merge a known dstate with others, while it can be."""
+        while ranked := self._ranked(root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True):
+            self.merge(ranked[0][1], root, forced=True)
+            root = int(self.root[root])
+
     def settle_at_any_rate(self, step: int) -> None:
         root = int(self.root[step])
         ranked = self._ranked(root, self._fitting(root))
@@ -170,11 +189,11 @@ class _Classes:
         fits: list[int] = known[~self._apart[np.ix_(known, self._members[root])].any(axis=1)].tolist()
         return fits
 
-    def _ranked(self, root: int, fits: Sequence[int]) -> list[tuple[int, int]]:
+    def _ranked(self, root: int, fits: Sequence[int], *, forced: bool = False) -> list[tuple[int, int]]:
         """The evidence for each of these dstates that the class can be merged with, most first, and the dstate."""
         found = []
         for dstate in fits:
-            evidence = self.merge(dstate, root)
+            evidence = self.merge(dstate, root, forced=forced)
             if evidence is not None:
                 found.append((evidence, dstate))
                 self._take_back()

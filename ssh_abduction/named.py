@@ -21,26 +21,27 @@ CORES conflicts the numbers of dstates are asked for one by one instead, from th
 there is none, the bound is one higher. The first answer without a rest is a minimal map, as it costs what the bound is; the same
 search then goes on with the other maps.
 
-Beside all that, where the trace lets itself be taken for one of places with frames, a map near a guess is sought (`annealing.py`, `nearby.py`), in
-a thread of its own, or where there is but one processor, first and not for long. Whatever bound meets it ends the search. Where none is
-sought, steps are merged by evidence (`merging.py`), so that a limit leaves a map that is not bad.
+Beside all that small maps are sought in a thread of its own, or where there is but one processor, first and not for long. First steps are merged by
+evidence (`merging.py`), so that a limit leaves a map that is not bad; then a map is guessed, of places with frames where the trace lets itself be
+taken for one of these (`annealing.py`), and smaller ones are sought near it (`nearby.py`). Whatever bound meets them ends the search.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction import facts
-from ssh_abduction.annealing import annealed
+from ssh_abduction.annealing import annealed, annealed_steps
 from ssh_abduction.apart import apart_from, clique
 from ssh_abduction.chart import Chart, NoFrame, numbered
 from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Stopped, Watch
-from ssh_abduction.merging import merged
+from ssh_abduction.merging import merged, merged_near, thinned
 from ssh_abduction.nearby import AT_A_TIME, Beside, NearbyEngine, mended
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
@@ -52,6 +53,7 @@ PREPARING = 0.6  # of the time that grounding took, clingo takes before it begin
 SPARES = 2  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
 CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
+GUESSES = 10  # that are waited for until one is a map, where the robot does not turn
 TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside it
 
 
@@ -159,9 +161,6 @@ class NamedEngine(ChartedEngine):
                 if not lazy:
                     self._ask_one_by_one()
                     continue
-                if self._speedups.greedy and len(self._chart.seen) <= AT_ONCE and not self._beside:
-                    actions = [action for _, action, _ in self._chart.links]
-                    yield merged(self._chart.seen, actions, self.clique, self._watch.check)
                 self._add(self._chart.links)
                 self._configure()
             elif not self._widened(answer):
@@ -174,12 +173,8 @@ class NamedEngine(ChartedEngine):
         yield self._follow(self._first_of_bound())[0]
 
     def _search_nearby(self) -> Iterator[list[int]]:
-        """Begin to search for a map near a guess, in another thread; or search for a while, and give what is found."""
-        if not self._speedups.annealed or len(self._chart.seen) > AT_ONCE:
-            return
-        try:
-            chart = Chart.turned(self._trace, self._log, self.size)
-        except NoFrame:
+        """Begin to search for small maps in another thread; or search for a while, and give what is found."""
+        if len(self._chart.seen) > AT_ONCE or not (self._speedups.greedy or self._speedups.annealed):
             return
         beside = self._has_processors()
         watch = Watch(None, None, lambda: None, beside=self._watch) if beside else self._watch
@@ -195,20 +190,49 @@ class NamedEngine(ChartedEngine):
             far=self._far,
             configuration="tweety",
         )
-
-        def guessed() -> list[int]:
-            labels = annealed(chart, watch.check, rough=True).labels(chart)
-            return mended([labels[node] for node in chart.node_of], self._chart)
-
+        found = self._small_maps(engine, watch.check, None if beside else TRIES)
         if beside:
-            self._beside = Beside(engine, watch, guessed)
+            self._beside = Beside(engine, watch, found)
             return
-        for labels in engine.fewer(guessed(), TRIES):
+        for labels in found:
             self._heed(labels, 0)
             yield labels
         if engine.bound:
             self._heed(self._known, engine.bound)
             raise _Settled
+
+    def _small_maps(self, engine: NearbyEngine, check: Callable[[], None], tries: int | None) -> Iterator[list[int]]:
+        """Labels, each time fewer: of a map merged by evidence, of one that is guessed, and of those near that."""
+        apart, links = self._chart.apart(AT_ONCE), self._chart.links
+        fewest = len(links) + 2
+        if self._speedups.greedy:
+            labels = merged(apart, links, self.clique, check)
+            fewest = len(set(labels))
+            yield labels
+        guess = self._guessed(check) if self._speedups.annealed else None
+        if guess is None:
+            return
+        known = thinned(apart, links, merged_near(apart, links, guess, check=check) or guess, check)
+        del apart  # as large as steps x steps
+        for labels in engine.fewer(known, tries):
+            if len(set(labels)) < fewest:
+                yield labels
+
+    def _guessed(self, check: Callable[[], None]) -> list[int] | None:
+        """A guess at the dstates of all steps, -1 where it is not sure; None where that would take too much memory."""
+        try:
+            chart = Chart.turned(self._trace, self._log, self.size)
+        except NoFrame:
+            guesses: Iterable[list[int]] = islice(annealed_steps(self._chart, self.clique, self._may_be, check), GUESSES)
+        else:
+            labels = annealed(chart, check, rough=True).labels(chart)
+            guesses = [[labels[node] for node in chart.node_of]]
+        guess = None
+        for labels in guesses:
+            guess = mended(labels, self._chart)
+            if self._chart.is_map(guess):
+                break
+        return guess
 
     def _settled(self) -> bool:
         """Never. Raises _Settled where the search beside this one has as few dstates as the bound."""
@@ -361,7 +385,7 @@ class NamedEngine(ChartedEngine):
         self._batches = 0
         self.ground_seconds += time.perf_counter() - began
         links, self._links = self._links, {}
-        self._give(links)
+        self._add(links)
         self._restart_seconds = time.perf_counter() - began
 
     def _add(self, links: Iterable[Link]) -> None:

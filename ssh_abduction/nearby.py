@@ -25,7 +25,7 @@ import random
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from itertools import pairwise
 from typing import Any, Literal, TypeAlias
@@ -47,7 +47,7 @@ WIDE = 10  # as many times as many, where nothing is assumed of steps
 REGIONS = 40  # parts of the map that are drawn anew in vain, before anything else is tried
 FIRST_REGION = 10  # dstates of such a part, at first
 PREPARING = 1.0  # times as long as grounding took, about, clingo prepares to solve, and cannot be stopped
-AT_A_TIME = 500  # links that clingo is given in one go
+AT_A_TIME = 100  # links that clingo is given in one go
 
 Labels: TypeAlias = list[int]
 _Key: TypeAlias = tuple[int, int]  # what is seen at a node, and its label
@@ -359,9 +359,9 @@ class Beside:
     labels  of the last map found, if any
     """
 
-    def __init__(self, engine: NearbyEngine, watch: Watch, guess: Callable[[], Sequence[int]]) -> None:
+    def __init__(self, engine: NearbyEngine, watch: Watch, found: Iterator[Labels]) -> None:
         self.labels: Labels | None = None
-        self._engine, self._watch, self._guess = engine, watch, guess
+        self._engine, self._watch, self._found = engine, watch, found
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -385,7 +385,7 @@ class Beside:
 
     def _run(self) -> None:
         try:
-            for labels in self._engine.fewer(self._guess()):
+            for labels in self._found:
                 self.labels = labels
         except Stopped:
             pass

@@ -85,8 +85,8 @@ def framed_theories(draw: st.DrawFn) -> Theory:
 class Before(Beside):
     """A search that comes to its end before the other one goes on."""
 
-    def __init__(self, engine: NearbyEngine, watch: Watch, guess: Callable[[], Sequence[int]]) -> None:
-        super().__init__(engine, watch, guess)
+    def __init__(self, engine: NearbyEngine, watch: Watch, found: Iterator[list[int]]) -> None:
+        super().__init__(engine, watch, found)
         self._thread.join()
 
 

@@ -150,10 +150,11 @@ def _labels_of(chart: Chart, states: tuple[object, ...], number: dict[object, in
 def test_what_goes_wrong_in_the_thread_is_raised_where_the_result_is_asked_for() -> None:
     trace = Trace.from_steps("abab", ["travel", "right", "travel"])
 
-    def guess() -> list[int]:
+    def found() -> Generator[list[int]]:
+        yield [0, 1, 0, 1]
         raise ZeroDivisionError
 
-    beside = Beside(nearby_engine(trace), Watch(None, None, lambda: None), guess)
+    beside = Beside(nearby_engine(trace), Watch(None, None, lambda: None), found())
     while beside.running:
         time.sleep(0.001)
     with pytest.raises(ZeroDivisionError):

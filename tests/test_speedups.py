@@ -12,10 +12,13 @@ from hypothesis import strategies as st
 from instances import maze, moore
 from strategies import traces
 
-from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, engine, facts, named, solve, solver
+from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, annealing, engine, facts, named, solve, solver
+from ssh_abduction.annealing import annealed_steps
 from ssh_abduction.apart import apart_from, apartness, clique, far_apart
+from ssh_abduction.chart import Chart
 from ssh_abduction.checker import check
-from ssh_abduction.merging import merged
+from ssh_abduction.merging import merged, thinned
+from ssh_abduction.nearby import NearbyEngine
 from ssh_abduction.replay import Log
 
 NAMES = [f.name for f in fields(Speedups)]
@@ -167,23 +170,57 @@ def test_unknown_speedups_are_an_error() -> None:
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(traces(max_steps=12))
 def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
+    """So they do where each step was a dstate, and these are merged while they can be."""
     theory = Theory.causal()
     log = Log(trace, theory)
-    apart = apartness(log.seen, log.actions)
-    labels = merged(log.seen, log.actions, clique(apart, log.seen))
-    found = facts.causal_map(labels, trace)
-    assert check(trace, found, theory) == ()
+    apart, links = apartness(log.seen, log.actions), Chart.of_steps(log, len(trace)).links
     fewest = solve(trace, theory).cost
     assert fewest
-    assert fewest.dstates <= len(found.dstates) <= len(trace)
+    known = merged(apart, links, clique(apart, log.seen))
+    for labels in known, thinned(apart, links, range(len(trace))), thinned(apart, links, known):
+        found = facts.causal_map(labels, trace)
+        assert check(trace, found, theory) == ()
+        assert fewest.dstates <= len(found.dstates) <= len(trace)
+        if labels is not known:
+            assert thinned(apart, links, labels) == labels
+
+
+def test_dstates_that_are_one_are_merged() -> None:
+    """A machine of two states, of which the odd and even visits are told apart."""
+    log = Log(trace := Trace.from_steps("ababababa", ["go"] * 8), Theory.causal())
+    apart, links = apartness(log.seen, log.actions), Chart.of_steps(log, len(trace)).links
+    assert thinned(apart, links, [0, 1, 2, 3, 0, 1, 2, 3, 0]) == [0, 1, 0, 1, 0, 1, 0, 1, 0]
 
 
 def test_a_limit_leaves_a_map_of_merged_steps() -> None:
     """Twice as good as one that is made at once, where clingo takes its time and no guess is annealed."""
     walk = maze(5, 5, steps=1600, seed=0)
     with patch.multiple(named, PATIENCE=1, CORES=1), patch.object(named.NamedEngine, "_ask_one_by_one", side_effect=KeyboardInterrupt):
-        solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,annealed"))
+        solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,annealed,threads"))
     assert solution.status is Status.FEASIBLE
     assert solution.cost
     assert solution.cost.dstates < 2 * len(set(walk.truth)) < len(set(Log(walk.trace, Theory.causal()).merged()))
     assert check(walk.trace, solution.maps[0], Theory.causal()) == ()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
+    """Of a machine that does not turn."""
+    walk = moore(12, 2, steps=800, seed=seed)
+    with (
+        patch.object(named, "PATIENCE", 1),
+        patch.object(annealing, "STEPS", ((0.75, 300),)),
+        patch.object(NearbyEngine, "_take", side_effect=KeyboardInterrupt),
+    ):
+        solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,threads"))
+    assert solution.status is Status.FEASIBLE
+    assert solution.cost
+    assert solution.cost.dstates <= 1.2 * len(set(walk.truth))
+    assert check(walk.trace, solution.maps[0], Theory.causal()) == ()
+
+
+def test_a_guess_that_takes_too_much_memory_is_not_begun() -> None:
+    walk = moore(8, 2, steps=100, seed=0)
+    chart = Chart.of_steps(Log(walk.trace, Theory.causal()), 101)
+    with patch.object(annealing, "ENTRIES", 100):
+        assert list(annealed_steps(chart, [0], [[0]] * 101)) == []
