@@ -100,7 +100,7 @@ def plainly_charted(engine: FramedEngine, size: int) -> FramedChart:
     return Chart.framed(engine._trace, engine._log, size)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=70, deadline=None, derandomize=True)
 @given(framed_traces(), framed_theories(), st.sets(st.sampled_from(SPEEDUPS)), st.data())
 def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off: set[str], data: st.DataObject) -> None:
     """With prefixes, cores and what is told in one go so small that all of it happens on short traces; and with any speed-ups off."""
@@ -210,7 +210,7 @@ def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, 
     assert found.count == len(set(found.maps))
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(framed_traces(), framed_theories(), st.data())
 def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, data: st.DataObject) -> None:
     """Whether clingo is told what is new, or all of it anew."""
