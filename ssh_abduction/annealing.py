@@ -118,7 +118,7 @@ def attempts(chart: FramedChart, check: Callable[[], None] = lambda: None, *, ro
 def annealed_steps(
     chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None] = lambda: None
 ) -> Iterator[list[int]]:
-    """Guesses without end at the dstates of all steps, as labels; -1 where a guess is not sure. They become better. None where that takes too much memory.
+    """Guesses at the dstates of all steps, as labels, -1 where they are not sure; ever better ones, without end. There are none where that takes too much memory.
 
     clique  steps that are pairwise apart
     may_be  of each step, the numbers of those of the clique that it may be one with

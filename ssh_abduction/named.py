@@ -204,7 +204,7 @@ class NamedEngine(ChartedEngine):
     def _small_maps(self, engine: NearbyEngine, check: Callable[[], None], tries: int | None) -> Iterator[list[int]]:
         """Labels, each time fewer: of a map merged by evidence, of one that is guessed, and of those near that."""
         apart, links = self._chart.apart(AT_ONCE), self._chart.links
-        fewest = len(links) + 2
+        fewest = len(self._chart.seen) + 1
         if self._speedups.greedy:
             labels = merged(apart, links, self.clique, check)
             fewest = len(set(labels))
