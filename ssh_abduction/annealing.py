@@ -30,6 +30,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, count, pairwise, repeat
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,7 @@ LIKELY = 16  # states that a visit is drawn from: likely ones, chosen anew
 ROUND = 50  # after so many sweeps
 
 States = NDArray[np.int_]
+_Kind = TypeVar("_Kind")
 
 
 @dataclass(frozen=True)
@@ -282,12 +284,7 @@ def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
     turned = [[tuple(star[(slot - r) % 4] for slot in range(4)) for r in range(4)] for star in chart.stars]
     kinds = [min(stars) for stars in turned]
     pinned = clique(np.logical_and.reduce(misfits), numbered(kinds))
-    named = Counter(kinds[visit] for visit in pinned)
-    spare: dict[tuple[int, ...], range] = {}
-    names = len(pinned)
-    for kind, visits in Counter(kinds).items():
-        spare[kind] = range(names, names + spares + max(0, visits // visits_each - named[kind]))
-        names = spare[kind].stop
+    spare = _spare(kinds, pinned, spares, visits_each)
     known = ~misfits[:, :, pinned].transpose(1, 2, 0).reshape(len(kinds), -1)  # visits x states of pinned places
     known[pinned] = False
     known[pinned, 4 * np.arange(len(pinned))] = True
@@ -300,13 +297,19 @@ def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
 def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]]) -> States:
     """The states that each step may be in: those of the clique, and spare ones for each view."""
     pinned = set(clique)
-    named = Counter(chart.seen[step] for step in clique)
-    spare: dict[int, range] = {}
-    names = len(clique)
-    for view, steps in Counter(chart.seen).items():
-        spare[view] = range(names, names + SPARES + max(0, steps // ROUGH_VISITS - named[view]))
-        names = spare[view].stop
+    spare = _spare(chart.seen, clique, SPARES, ROUGH_VISITS)
     return _padded([[*options, *(() if step in pinned else spare[chart.seen[step]])] for step, options in enumerate(may_be)])
+
+
+def _spare(kinds: Sequence[_Kind], pinned: Sequence[int], spares: int, visits_each: int) -> dict[_Kind, range]:
+    """Spare names for each kind of place, beyond those of the pinned visits."""
+    named = Counter(kinds[visit] for visit in pinned)
+    spare: dict[_Kind, range] = {}
+    names = len(pinned)
+    for kind, visits in Counter(kinds).items():
+        spare[kind] = range(names, names + spares + max(0, visits // visits_each - named[kind]))
+        names = spare[kind].stop
+    return spare
 
 
 def _padded(options: Sequence[Sequence[int]]) -> States:

@@ -70,7 +70,6 @@ class NamedEngine(ChartedEngine):
 
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
         super().__init__(trace, theory, watch, log, speedups)
-        self._restart_seconds = 0.0  # what the last new control took
         self._hard = self._one_by_one = False  # whether few conflicts were not enough, and whether raising the bound by cores stalled
         self._beside: Beside | None = None  # a search for a map near a guess
         self._known: list[int] | None = None  # labels of a map from there
@@ -360,7 +359,7 @@ class NamedEngine(ChartedEngine):
 
     def _restart(self) -> None:
         """Take a new control, for other names."""
-        self._watch.check(self._restart_seconds)
+        self._watch.check()
         began = time.perf_counter()
         self._end_begun()
         seen = self._chart.seen
@@ -386,7 +385,6 @@ class NamedEngine(ChartedEngine):
         self.ground_seconds += time.perf_counter() - began
         links, self._links = self._links, {}
         self._add(links)
-        self._restart_seconds = time.perf_counter() - began
 
     def _add(self, links: Iterable[Link]) -> None:
         """Give clingo more links, and the nodes at their ends: some at a time, as it cannot be stopped meanwhile."""
