@@ -97,12 +97,16 @@ class Watch:
         if self.elapsed() > self._next_tick:
             self._next_tick = self.elapsed() + TICK
             self._on_tick()
-        if self._allowed is not None and self.elapsed() + ahead > self._allowed:
-            raise Stopped("time limit")
-        if ahead and self._beside is not None and self._beside.left() < ahead:
+        if not self.allows(ahead):
             raise Stopped("time limit")
         if self._memory is not None and peak_memory() > self._memory:
             raise Stopped("memory limit")
+
+    def allows(self, seconds: float) -> bool:
+        """Whether there is time for so many seconds of what cannot be interrupted."""
+        if self._allowed is not None and self.elapsed() + seconds > self._allowed:
+            return False
+        return not seconds or self._beside is None or self._beside.left() >= seconds
 
     def left(self) -> float:
         """Seconds until the time limit."""

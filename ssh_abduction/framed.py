@@ -272,8 +272,8 @@ class FramedEngine(SameEngine):
         yield from self._bettered()
 
     def _bettered(self) -> Iterator[Found]:
-        """The known map with better streets, unless these were looked for already."""
-        if self._known and self._known_cost and len(self._theory.priorities) > 1:
+        """The known map with better streets, unless these were looked for already, or there is no time for that."""
+        if self._known and self._known_cost and len(self._theory.priorities) > 1 and self._watch.allows(PREPARED * self._street_seconds):
             cost, self._known_cost = self._known_cost, ()
             yield from (found for found in self._streets(_Naming(list(self._known), None), "opt", GUESSING) if found.cost < cost)
 

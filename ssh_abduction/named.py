@@ -40,7 +40,7 @@ from ssh_abduction import facts
 from ssh_abduction.annealing import annealed, annealed_steps
 from ssh_abduction.apart import apart_from, clique
 from ssh_abduction.chart import Chart, NoFrame, numbered
-from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found, Stopped, Watch
+from ssh_abduction.engine import AT_ONCE, POLL, ChartedEngine, Found, Stopped, Watch
 from ssh_abduction.merging import merged, merged_near, thinned
 from ssh_abduction.nearby import AT_A_TIME, Beside, NearbyEngine, mended
 from ssh_abduction.replay import Log
@@ -128,7 +128,11 @@ class NamedEngine(ChartedEngine):
             yield [0]
             return
         try:
-            yield from self._searched()
+            try:
+                yield from self._searched()
+            except Stopped:
+                self._outlasted()
+                raise
         except _Settled:
             self._end_beside()
             yield self._known or []
@@ -241,6 +245,14 @@ class NamedEngine(ChartedEngine):
             if self._known and len(set(self._known)) <= (self.bound or 0):
                 raise _Settled
         return False
+
+    def _outlasted(self) -> None:
+        """Let the search beside this one use what time is left, where clingo was not asked as it would have taken too long to prepare."""
+        while self._beside is not None and self._beside.running:
+            self._watch.check()
+            self._settled()
+            time.sleep(POLL)
+        self._settled()
 
     def _end_beside(self) -> None:
         if self._beside is not None:

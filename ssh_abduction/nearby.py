@@ -357,18 +357,17 @@ class Beside:
     """A search for small maps in a thread of its own: numpy and clingo let go of Python's lock while they work.
 
     labels  of the last map found, if any
+    bound   of the engine, once the search is over
     """
 
     def __init__(self, engine: NearbyEngine, watch: Watch, found: Iterator[Labels]) -> None:
         self.labels: Labels | None = None
-        self._engine, self._watch, self._found = engine, watch, found
+        self.bound = 0
+        self._watch = watch
+        self._held = [engine, found]
         self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(engine, found), daemon=True)
         self._thread.start()
-
-    @property
-    def bound(self) -> int:
-        return self._engine.bound or 0
 
     @property
     def running(self) -> bool:
@@ -382,11 +381,13 @@ class Beside:
     def end(self) -> None:
         self._watch.interrupted = True
         self._thread.join()
+        threading.Thread(target=self._held.clear).start()  # to free clingo's control may take seconds, for which nobody has to wait
 
-    def _run(self) -> None:
+    def _run(self, engine: NearbyEngine, found: Iterator[Labels]) -> None:
         try:
-            for labels in self._found:
+            for labels in found:
                 self.labels = labels
+            self.bound = engine.bound or 0
         except Stopped:
             pass
         except BaseException as error:

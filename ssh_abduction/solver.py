@@ -401,6 +401,8 @@ class Search:
         """Extend the prefix until a minimal map of it replays to the end. False where the prefix has no map."""
         size = min(len(self.trace), self._start)
         while True:
+            if size == len(self.trace):
+                self._watch.use_reserve()  # which is for a search like this one
             self._engine.grow(size)
             minimal = self._minimise()
             if minimal is None:

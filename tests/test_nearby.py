@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from unittest.mock import Mock, patch
 
 import pytest
@@ -138,6 +138,35 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
     assert solution.cost
     assert solution.cost.dstates == best[0] <= 64
     assert check(walk.trace, solution.maps[0], CAUSAL) == ()
+
+
+def test_where_clingo_would_prepare_for_too_long_the_search_beside_goes_on() -> None:
+    """Which proves here what the other one was stopped at."""
+    walk = maze(3, 3, steps=800, seed=0)
+    expected = solve(walk.trace, CAUSAL).cost
+    add = named.NamedEngine._add
+
+    def stop(self: named.NamedEngine, links: Iterable[named.Link]) -> None:
+        if self._beside:
+            raise engine.Stopped("time limit")
+        add(self, links)
+
+    with (
+        patch.multiple(named, PATIENCE=1),
+        patch.object(named.NamedEngine, "_has_processors", lambda _: True),
+        patch.object(named.NamedEngine, "_add", stop),
+    ):
+        solution = solve(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"), maps=1)
+    assert solution.status is Status.OPTIMAL
+    assert solution.cost == expected
+
+
+def test_a_search_of_the_whole_trace_keeps_no_time_back() -> None:
+    """What is kept back is for that search; to begin it once more would throw away what it has come to."""
+    with patch.object(solver.Search, "_salvage", side_effect=AssertionError):
+        solution = solve(maze(10, 10, steps=1000, seed=0, stars=True).trace, limit=2)
+    assert solution.stopped == "time limit"
+    assert solution.seconds.total > 1.9
 
 
 def _labels_of(chart: Chart, states: tuple[object, ...], number: dict[object, int]) -> list[int]:
