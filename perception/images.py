@@ -32,10 +32,11 @@ def images_of(trace: Trace) -> NDArray[np.float64]:
                 )
             rows.append(table[image] if isinstance(image, int) else image)
         held = rows
-    beams = len(held[0])  # type: ignore[arg-type]
-    for i, image in enumerate(held):
-        if len(image) != beams:  # type: ignore[arg-type]
-            raise PerceptionError(f"{trace.at(i)}: image: expected {beams} ranges, as the first has, got {len(image)}")  # type: ignore[arg-type]
+    lengths = [len(image) for image in held]  # type: ignore[arg-type]
+    for i, beams in enumerate(lengths):
+        if beams != lengths[0]:
+            mend = "give every image the same number of beams"
+            raise PerceptionError(f"{trace.at(i)}: image: expected {lengths[0]} ranges, as the first has, got {beams}; {mend}")
     return np.array(held, dtype=float)
 
 

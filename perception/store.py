@@ -82,7 +82,9 @@ def load(path: str | os.PathLike[str]) -> Stored:
     except OSError as error:
         raise PerceptionError(f"{path}: expected a readable recogniser: {error.strerror or error}; check the path") from None
     except Exception as error:  # a damaged archive fails in as many ways as it has parts
-        raise PerceptionError(f"{path}: expected a .skops file written by save, got something else ({type(error).__name__})") from error
+        raise PerceptionError(
+            f"{path}: expected a .skops file that train or save wrote, got something else ({type(error).__name__})"
+        ) from error
     if not isinstance(held, dict) or held.get("format") != FORMAT:
         raise PerceptionError(f"{path}: expected a file of format {FORMAT}, got another object")
     if held.get("version") != VERSION:

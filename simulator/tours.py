@@ -63,6 +63,8 @@ def simulate(
     """
     if tours < 1:
         raise SimulatorError(f"tours: expected 1 or more, got {tours}")
+    if every is not None and not (math.isfinite(every) and every > 0):
+        raise SimulatorError(f"every: expected a number of metres above 0, got {every}; leave it out for images at dstates")
     if not world.route:
         raise SimulatorError(f"{world.name}: route: expected at least one action, got none; add it to the world, or give one")
     body = body or Body()
@@ -72,7 +74,7 @@ def simulate(
     rng = np.random.default_rng(seed)
     robot = Robot(body, world.start, rng)
     driver = Driver(world.arranged(rng), robot, laser or Laser(), rng, tolerance or Tolerance())
-    logged = _evenly(driver, world, tours, every) if every else _at_dstates(driver, world, tours, stars)
+    logged = _evenly(driver, world, tours, every) if every is not None else _at_dstates(driver, world, tours, stars)
     steps = list(logged)
     steps[-1] = Step(image=steps[-1].image, star=steps[-1].star, truth=steps[-1].truth)
     return Trace(tuple(steps), name=f"{world.name}, {tours} tours, seed {seed}")

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 from clingo import Function, Model, Number, String, Symbol, SymbolType
 
+from ssh_abduction import encodings
 from ssh_abduction.chart import FramedChart
 from ssh_abduction.maps import DState, Path, SSHMap
 from ssh_abduction.theory import Theory
@@ -63,7 +64,7 @@ def program(trace: Trace, theory: Theory) -> str:
     files = " ".join(f"{name}.lp" for name in encoding_names(theory))
     return "\n".join(
         [
-            f"% {len(trace)} steps{f' of {trace.name!r}' if trace.name else ''}. In the folder of the encodings, run",
+            f"% {len(trace)} steps{f' of {trace.name!r}' if trace.name else ''}. In {encodings.folder()}, run",
             f"%   python run.py --project=project --opt-mode=optN -n 0 THIS_FILE {files}",
             theory_facts(theory, most_paths(trace, theory, len(trace))),
             trace_facts(trace, theory, 0, len(trace)),

@@ -234,11 +234,11 @@ class Search:
             if isinstance(value, bool) or not isinstance(value, int | float | None):
                 raise SolverError(f"{name}: expected a number, got {brief(value)}")
         if limit is not None and not limit > 0:
-            raise SolverError(f"limit: expected a number of seconds above 0, got {brief(limit)}; leave it out for none")
+            raise SolverError(f"limit (--time-limit): expected a number of seconds above 0, got {brief(limit)}; leave it out for none")
         if maps < 0:
-            raise SolverError(f"maps: expected 0 (all) or more, got {maps}")
+            raise SolverError(f"maps (--maps): expected 0 (all) or more, got {maps}")
         if memory is not None and memory <= 0:
-            raise SolverError(f"memory: expected a number of MiB above 0, got {brief(memory)}; leave it out for none")
+            raise SolverError(f"memory (--memory-limit): expected a number of MiB above 0, got {brief(memory)}; leave it out for none")
         self.theory = (theory or Theory.topological()).resolve(trace)
         self.trace = trace
         self.status = Status.UNKNOWN

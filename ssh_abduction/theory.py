@@ -26,6 +26,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "star": ("auto", "none", "pattern", "frame"),
 }
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
+CAUSAL = "Theory.causal() (--theory causal)"  # in error messages
 
 
 @dataclass(frozen=True)
@@ -69,11 +70,11 @@ class Theory:
         if self.level == "causal":
             for name, value in (("boundary", "none"), ("star", "none")):
                 if getattr(self, name) != value:
-                    raise TheoryError(f"{name}: expected {value} with level=causal, got {getattr(self, name)}; take level=topological")
+                    raise TheoryError(f"{name}: expected {value} with level=causal, got {getattr(self, name)}; take {CAUSAL}")
             if set(self.prefer) - {"dstates"}:
-                raise TheoryError(f"prefer: expected dstates with level=causal, got {', '.join(self.prefer)}; take level=topological")
+                raise TheoryError(f"prefer: expected dstates with level=causal, got {', '.join(self.prefer)}; take {CAUSAL}")
         if "excuses" in self.prefer and self.boundary != "defeasible":
-            raise TheoryError(f"prefer: expected no excuses with boundary={self.boundary}; take boundary=defeasible")
+            raise TheoryError(f"prefer: expected no excuses with boundary={self.boundary}; take {_choice('boundary', 'defeasible')}")
 
     def _set_names(self, field: str, allowed: Iterable[str]) -> None:
         value = getattr(self, field)
@@ -132,7 +133,8 @@ class Theory:
         if star == "auto":
             star = "frame" if trace.has_stars else "none"
         if star != "none" and not trace.has_stars:
-            raise TheoryError(f"star: expected a trace with stars for star={star}, got none; add them to the steps, or take star=none")
+            mend = f"add them to the steps, or take {_choice('star', 'none')}"
+            raise TheoryError(f"star: expected a trace with stars for star={star}, got none; {mend}")
         theory = replace(self, star=star)
         for i, step in enumerate(trace.steps):
             theory.require(step, trace.at(i))
@@ -141,20 +143,20 @@ class Theory:
     def require(self, step: Step, where: str) -> None:
         """Raises TraceError, which says where, if a step lacks what the axioms need. Star has to be settled."""
         if step.view is None:
-            raise TraceError(f"{where}: view: expected one, got only an image; cluster the images into views first")
+            raise TraceError(f"{where}: view: expected one, got only an image; cluster the images into views first (ssh-abduction cluster)")
         if self.level == "topological" and step.action is not None and step.action.kind is None:
             raise TraceError(
                 f'{where}: action.kind: expected "travel" or "turn" in a topological theory, got none for {brief(step.action.name)}; '
-                f'write {{"name": …, "kind": "travel"}}, or take --theory causal'
+                f'write {{"name": …, "kind": "travel"}} or {{"name": …, "kind": "turn", "turn": "right"}}, or take {CAUSAL}'
             )
         if self.star == "none":
             return
         if step.star is None:
-            raise TraceError(f"{where}: star: expected one, as other steps have stars; add it, or take star=none")
+            raise TraceError(f"{where}: star: expected one, as other steps have stars; add it, or take {_choice('star', 'none')}")
         try:
             _ = step.openings
         except TraceError as error:
-            raise TraceError(f"{where}: {error}, or take star=none") from None
+            raise TraceError(f"{where}: {error}, or take {_choice('star', 'none')}") from None
 
     def to_dict(self) -> dict[str, Any]:
         """The theory as plain data."""
@@ -167,6 +169,11 @@ class Theory:
             raise TheoryError(f"theory: expected an object, got {brief(data)}")
         preset = cls.causal() if data.get("level") == "causal" else cls()
         return preset.replace(**{str(k): tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+
+
+def _choice(name: str, value: str) -> str:
+    """A choice as an error message names it: in Python, and in the shell."""
+    return f"{name}={value} (--{name} {value})"
 
 
 PRESETS: dict[str, Callable[[], Theory]] = {

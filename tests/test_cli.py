@@ -98,6 +98,7 @@ def test_an_impossible_trace_says_which_axioms_clash_where(tmp_path: Path, capsy
     out = capsys.readouterr().out
     assert out.startswith("unsatisfiable: no map satisfies the axioms: in steps 2 to 5 these clash: functional_view (step 5)")
     assert "turn_around_reverses (steps 4, 5)" in out
+    assert f"from {path}:4 to {path}:7" in out
     assert main(["solve", path, "--json"]) == 20
     data = json.loads(capsys.readouterr().out)
     assert (data["status"], data["count"], data["cost"], data["complete"]) == ("unsatisfiable", 0, None, True)
@@ -276,6 +277,13 @@ def test_bad_maps_are_one_line(verb: str, text: str, tmp_path: Path, capsys: pyt
 def test_contradicting_choices_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["solve", ACES, "--theory", "causal", "--boundary", "strict"]) == 1
     assert capsys.readouterr().err.startswith("ssh-abduction: boundary: expected none with level=causal")
+
+
+def test_the_level_alone_is_a_choice(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["solve", ACES, "--level", "causal"]) == 0
+    alone = capsys.readouterr().out
+    assert main(["solve", ACES, "--theory", "causal"]) == 0
+    assert re.sub(r"\d\.\d\d s", "", alone) == re.sub(r"\d\.\d\d s", "", capsys.readouterr().out)
 
 
 def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from ssh_abduction.cli import main
 from ssh_abduction.picture import svg
-from ssh_abduction.solver import solve
+from ssh_abduction.solver import Status, solve
 from ssh_abduction.trace import Trace
 
 ROOT = Path(__file__).parent.parent
@@ -28,7 +28,7 @@ def without_seconds(text: str) -> str:
 
 def test_the_python_lines_print_what_is_shown() -> None:
     indices = [i for i, (language, _) in enumerate(BLOCKS) if language == "python"]
-    assert len(indices) == 2
+    assert len(indices) == 3
     for index in indices:
         with contextlib.redirect_stdout(io.StringIO()) as out:
             exec(BLOCKS[index][1], {})
@@ -58,6 +58,12 @@ def test_the_line_of_many_traces_prints_what_is_shown() -> None:
     done = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert without_seconds(done.stdout) == without_seconds(BLOCKS[index + 1][1])
+
+
+def test_the_trace_of_the_formats_page_has_a_map(tmp_path: Path) -> None:
+    written = tmp_path / "trace.jsonl"
+    written.write_text((ROOT / "docs" / "formats.md").read_text().split("```")[1].lstrip())
+    assert solve(Trace.load(written)).status is Status.OPTIMAL
 
 
 def test_the_picture_is_the_map() -> None:

@@ -373,3 +373,6 @@ def test_no_route_and_no_tours(tmp_path: Path) -> None:
         simulate(world_of(tmp_path, route=[]))
     with pytest.raises(SimulatorError, match="tours: expected 1 or more"):
         simulate(RECTANGLE, tours=0)
+    for every in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(SimulatorError, match="every: expected a number of metres above 0"):
+            simulate(RECTANGLE, every=every)

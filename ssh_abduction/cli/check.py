@@ -23,8 +23,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument("maps", help="what solve --json printed, or one saved map")
     parser.add_argument("--bound", action="store_true", help="check the proof that no map has fewer dstates, too")
-    add_theory(parser)
-    parser.set_defaults(run=run, theory=None)
+    add_theory(parser, default="the theory of the maps, or topological")
+    parser.set_defaults(run=run)
     parser.epilog = "Without --theory, the theory is the one that the file of maps was solved under; other flags are laid over it."
 
 

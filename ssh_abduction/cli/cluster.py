@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -35,6 +36,8 @@ def run(options: argparse.Namespace) -> int:
     images = ReciprocalTransformer().fit_transform(images_of(trace))
     try:
         clusterer = ViewClusterer(k=options.k, k_max=options.k_max, random_state=options.seed).fit(images)
+    except SSHError as error:
+        raise SSHError(f"{options.trace}: {error}") from None
     except ValueError as error:  # scikit-learn's own words for what cannot be clustered
         raise SSHError(f"{options.trace}: images: {error}; log more images, or others") from None
     truth = true_dstates(trace)
@@ -44,7 +47,12 @@ def run(options: argparse.Namespace) -> int:
     beside = trace.images and os.path.relpath(Path(trace.source or ".").parent / trace.images, Path(options.output).parent)
     replace(trace.with_views(clusterer.labels_.tolist()), images=beside).save(options.output)
     rows = [
-        [k, f"{m:.3f}", *([f"{uncertainty[k]:.3f}"] if uncertainty else []), "chosen" if k == clusterer.k_ else ""]
+        [
+            k,
+            "–" if math.isnan(m) else f"{m:.3f}",
+            *([f"{uncertainty[k]:.3f}"] if uncertainty else []),
+            "chosen" if k == clusterer.k_ else "",
+        ]
         for k, m in clusterer.quality_.items()
     ]
     print(table(["k", "M", *(["U"] if uncertainty else []), ""], rows))

@@ -11,10 +11,10 @@ from ssh_abduction.theory import CHOICES, COUNTS, PRESETS, Theory
 Verbs = Any  # argparse's type for what add_subparsers returns is private
 
 
-def add_theory(parser: argparse.ArgumentParser) -> None:
+def add_theory(parser: argparse.ArgumentParser, default: str = "topological, or causal with --level causal") -> None:
     """Add --theory PRESET, and a flag for each field of Theory to lay over it."""
     group = parser.add_argument_group("theory", "a preset, and choices laid over it")
-    group.add_argument("--theory", choices=PRESETS, default="topological", help="preset (default: topological)")
+    group.add_argument("--theory", choices=PRESETS, help=f"preset (default: {default})")
     for name, values in CHOICES.items():
         group.add_argument(f"--{name.replace('_', '-')}", choices=values)
     for name, text in (
@@ -34,4 +34,5 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
         chosen["prefer"] = ()
     if options.theory is None and found is not None:
         return found.replace(**chosen)
-    return PRESETS[options.theory or "topological"]().replace(**chosen)
+    preset = "causal" if chosen.get("level") == "causal" else "topological"
+    return PRESETS[options.theory or preset]().replace(**chosen)

@@ -150,6 +150,9 @@ def dump(value: dict[str, Any]) -> str:
 def _print_text(search: Search, solution: Solution, explanation: Explanation | None) -> None:
     print(headline(solution, search.count, explanation))
     if solution.status is Status.UNSATISFIABLE:
+        if explanation:
+            first, last = search.trace.at(explanation.first), search.trace.at(explanation.last)
+            print(f"look at what was seen and done from {first} to {last}, or leave one of these axioms out: --without NAME")
         return
     if solution.cost is None:
         if solution.partial:
