@@ -91,23 +91,23 @@ class Guess:
         return Guess(self.states, self.sure & ~np.isin(self.states // 4, list(loose)))
 
 
-def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False) -> Guess:
-    """A guess at the states of all visits. `check` is called now and then, and may raise.
-
-    rough  be content with fewer names, if places were visited often, and with fewer sweeps
-    """
-    few = len(chart.travels) // FEW if rough else 0
+def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Guess:
+    """A rough guess at the states of all visits. `check` is called now and then, and may raise."""
     found: dict[int, Guess] = {}
     began = time.perf_counter()
-    for failed, guess in attempts(chart, check, rough=rough):
+    for failed, guess in attempts(chart, check, rough=True):
         found.setdefault(failed, guess)
-        if failed <= few or time.perf_counter() - began > SECONDS:
+        if failed <= len(chart.travels) // FEW or time.perf_counter() - began > SECONDS:
             return found[min(found)]
     raise AssertionError
 
 
 def attempts(chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False) -> Iterator[tuple[int, Guess]]:
-    """Guesses without end, each with how many travels do not lead where most such travels do. Parameters as above."""
+    """Guesses without end, each with how many travels do not lead where most such travels do.
+
+    check  called now and then, and may raise
+    rough  be content with fewer names, as does where places were visited often, and with fewer sweeps
+    """
     leaves = list(chart.leaves.values())
     for attempt in count(1):
         options = _options(chart, SPARES * ((attempt + 1) // 2), ROUGH_VISITS if rough else VISITS)

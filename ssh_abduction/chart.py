@@ -20,7 +20,7 @@ from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from ssh_abduction.replay import Log
 from ssh_abduction.trace import Trace, TurnDirection
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+Link: TypeAlias = tuple[int, int, int]  # node, action, node
 QUARTERS: dict[TurnDirection | None, int] = {"right": 1, "around": 2, "left": 3}
 
 
@@ -46,7 +47,7 @@ class Chart:
     """
 
     seen: tuple[int, ...]
-    links: tuple[tuple[int, int, int], ...]
+    links: tuple[Link, ...]
     node_of: Sequence[int]
 
     @staticmethod
@@ -54,18 +55,12 @@ class Chart:
         """The chart of the first steps, each a node."""
         return Chart(tuple(log.seen[:size]), tuple((t, log.actions[t], t + 1) for t in range(size - 1)), range(size))
 
-    def apart(self, most: int) -> NDArray[np.bool_]:
-        """Which pairs of the first nodes, `most` at most, are apart."""
+    def apart(self, most: int | None = None) -> NDArray[np.bool_]:
+        """Which pairs of nodes, of the first `most` if so many are given, are apart: nodes x nodes."""
         from ssh_abduction.apart import apartness  # loads numpy
 
         seen = self.seen[:most]
         return apartness(seen, [action for _, action, _ in self.links[: len(seen) - 1]])
-
-    def far_apart(self, apart: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """The pairs of the matrix of all nodes of which names.lp should be told, if any: more than one action shows that they are apart."""
-        from ssh_abduction.apart import far_apart
-
-        return far_apart(apart, self.seen, [action for _, action, _ in self.links])
 
     def is_map(self, labels: Sequence[int]) -> bool:
         """Whether the labels of all nodes are those of a map: each dstate shows one view, and each action leads to one dstate."""
@@ -143,12 +138,12 @@ class FramedChart(Chart):
 
     facing: tuple[tuple[int, int], ...]
     stars: tuple[tuple[int, ...], ...]
-    travels: tuple[tuple[int, int, int], ...]
+    travels: tuple[Link, ...]
     elsewhere: Collection[tuple[int, int]] = ()
 
-    def apart(self, most: int, others: Sequence[int] | None = None) -> NDArray[np.bool_]:
-        """Which pairs of the first nodes are apart, or which of them and these others: no frame has both visits so turned that the two
-        nodes are one dstate.
+    def apart(self, most: int | None = None, others: Sequence[int] | None = None) -> NDArray[np.bool_]:
+        """Which pairs of nodes, of the first `most` if so many are given, are apart, or which of them and these others, nodes x others:
+        no frame has both visits so turned that the two nodes are one dstate.
 
         As in `apartness`, from the last visit to the first: visits do not fit if they show different things, or if the same action,
         done facing the same way, leads to visits that do not fit as they are.

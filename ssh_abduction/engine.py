@@ -320,10 +320,10 @@ class StepEngine(Engine):
                 part = f"steps_from_{self.size}"
                 stop = min(size, self.size + (8 if self.size < 32 else 1))
                 control.add(part, [], facts.trace_facts(self._trace, self._theory, self.size, stop))
-                control.ground([*base, (part, []), *(("step", facts.step_number(t)) for t in range(self.size, stop))])
+                control.ground([*base, (part, []), *(("step", facts.numbers(t)) for t in range(self.size, stop))])
                 self.size, base = stop, []
             if self._asked != size - 1:
-                control.ground([("check", facts.step_number(size - 1))])
+                control.ground([("check", facts.numbers(size - 1))])
                 if self._asked is not None:
                     control.release_external(facts.query(self._asked))
                 control.assign_external(facts.query(size - 1), True)

@@ -113,8 +113,8 @@ class _Axioms:
             facts.theory_facts(theory, len(trace) if relaxed else facts.most_paths(trace, theory, len(trace)))
             + facts.trace_facts(trace, theory, 0, len(trace)),
         )
-        steps = [("step", facts.step_number(t)) for t in range(len(trace))]
-        self._control.ground([("base", []), *steps, ("check", facts.step_number(last))])
+        steps = [("step", facts.numbers(t)) for t in range(len(trace))]
+        self._control.ground([("base", []), *steps, ("check", facts.numbers(last))])
         self._control.assign_external(facts.query(last), True)
         self._pairs = {facts.active(axiom, t): (axiom, t) for axiom in theory.axioms for t in range(len(trace))} if relaxed else {}
 

@@ -73,11 +73,6 @@ def program(trace: Trace, theory: Theory) -> str:
     )
 
 
-def step_number(t: int) -> list[Symbol]:
-    """The argument of the program parts of step t."""
-    return [Number(t)]
-
-
 def query(t: int) -> Symbol:
     """The external atom that makes t the last step."""
     return Function("query", [Number(t)])

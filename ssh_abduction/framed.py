@@ -39,7 +39,7 @@ from ssh_abduction.apart import Matrix
 from ssh_abduction.chart import Chart, FramedChart, NoFrame, numbered
 from ssh_abduction.engine import Found, Stopped, Watch, has_processors
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.merging import Told, kept, merged_near
+from ssh_abduction.merging import Told, kept, merged_as_told, merged_near
 from ssh_abduction.nearby import Beside, NearbyEngine, mended
 from ssh_abduction.replay import Log
 from ssh_abduction.same import SECONDS_A_PAIR, Pair, SameEngine, TakesLong, smaller
@@ -156,7 +156,7 @@ class FramedEngine(SameEngine):
     def _search_beside(self, chart: FramedChart) -> None:
         """Begin to guess in another thread, and to prove from there that the causal axioms need so many dstates."""
         watch, pinned = Watch(None, None, lambda: None, beside=self._watch), self.clique or [0]
-        apart = chart.apart(len(chart.seen), pinned)
+        apart = chart.apart(others=pinned)
         self._named = NearbyEngine(
             self._trace,
             self._theory,
@@ -179,7 +179,7 @@ class FramedEngine(SameEngine):
     def _guessed_labels(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
         """Labels of a map of the causal axioms: one that has streets, as far as single streets tell, or where that is not soon found one of few dstates."""
         began = time.thread_time()  # a thread may be made to wait
-        apart = chart.apart(len(chart.seen))
+        apart = chart.apart()
         found: list[list[int]] = []
         for _, guess in attempts(replace(chart, elsewhere=()), check):
             starts = [
@@ -187,10 +187,10 @@ class FramedEngine(SameEngine):
                 guess.labels(chart),
                 *(guess.loosened(chart, travels).labels(chart) for travels in range(LOOSENED)),
             ]
-            maps = [(merged_near(apart, chart.links, start, check=check), start) for start in starts]
-            ranked = sorted(((labels, start) for labels, start in maps if labels), key=lambda pair: len(set(pair[0])))
+            maps = [(merged_near(apart, chart.links, start, check), start) for start in starts]
+            ranked = sorted(maps, key=lambda pair: len(set(pair[0])))
             for _, start in ranked:
-                labels = merged_near(apart, chart.links, start, partial(self._told, chart), check)
+                labels = merged_as_told(apart, chart.links, start, partial(self._told, chart), check)
                 if labels and self._has_single_streets(chart, labels):
                     return labels
             found.append(ranked[0][0])
@@ -214,7 +214,7 @@ class FramedEngine(SameEngine):
         guess = [-1] * len(chart.seen)
         for node, label in zip(chart.node_of, known, strict=False):
             guess[node] = label
-        return self._single_streets(kept(chart.apart(len(chart.seen)), chart.links, guess))
+        return self._single_streets(kept(chart.apart(), chart.links, guess))
 
     def _has_single_streets(self, chart: FramedChart, labels: Sequence[int]) -> bool:
         return bool(self._settled_streets(chart, labels, single=True).solve().satisfiable)

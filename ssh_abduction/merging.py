@@ -26,12 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.apart import Matrix
-from ssh_abduction.chart import numbered
+from ssh_abduction.chart import Link, numbered
 
 # Least evidence for a merge, and how much it has to be ahead of the next; among how many known dstates at most:
 DEMANDS = ((10, 1), (5, 1), (5, 2), (3, 1), (3, 3), (2, 2), (2, 10), (1, 3), (1, 100), (0, 1), (0, 2), (0, 1000))
 
-Link: TypeAlias = tuple[int, int, int]  # node, action, node
 Told: TypeAlias = tuple[Matrix, Sequence[tuple[int, int]]]  # which nodes are apart, and pairs that are one
 
 
@@ -48,26 +47,35 @@ def merged(apart: Matrix, links: Iterable[Link], clique: Sequence[int], check: C
     return classes.labels()
 
 
-def merged_near(
+def merged_near(apart: Matrix, links: Iterable[Link], guess: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
+    """The same near a guess.
+
+    guess  a label of each node; -1 where it is not known. Nodes that cannot be at one dstate with the others of their label leave it
+    """
+    classes = _from_guess(apart, links, guess)
+    classes.settle_all(check)
+    return classes.labels()
+
+
+def merged_as_told(
     apart: Matrix,
     links: Iterable[Link],
     guess: Sequence[int],
-    tell: Callable[[Sequence[int], Sequence[int]], Told | None] | None = None,
+    tell: Callable[[Sequence[int], Sequence[int]], Told | None],
     check: Callable[[], None] = lambda: None,
 ) -> list[int] | None:
-    """The same near a guess. None where what is told rules that out.
+    """The same, where more is told on the way. None where that contradicts.
 
-    guess  a label of each node; -1 where it is not known. Nodes that cannot be at one dstate with the others of their label leave it
-    tell   is asked what follows from labels of all nodes, some of which are still open, whenever these have changed; None: they contradict
+    tell  is asked what follows from labels of all nodes, and which of these are still open, whenever they have changed; None: they contradict
     """
-    classes = _guessed(apart, links, guess)
-    agrees = classes.settle_all(check, lambda: not tell or classes.heed(tell(classes.labels(), classes.unsettled().tolist())))
+    classes = _from_guess(apart, links, guess)
+    agrees = classes.settle_all(check, lambda: classes.heed(tell(classes.labels(), classes.unsettled().tolist())))
     return classes.labels() if agrees else None
 
 
 def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int]:
     """The same where nothing is merged but what has to be: what is not known, or leaves its label, is something new."""
-    return _guessed(apart, links, guess).labels()
+    return _from_guess(apart, links, guess).labels()
 
 
 def thinned(apart: Matrix, links: Iterable[Link], labels: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
@@ -75,15 +83,16 @@ def thinned(apart: Matrix, links: Iterable[Link], labels: Sequence[int], check: 
 
     Those seen at the fewest nodes are merged first, each with that for which the evidence is most. Parameters as above; the labels are those of a map.
     """
-    classes = _guessed(apart, links, labels)
-    for root in sorted(np.flatnonzero(classes.known).tolist(), key=np.bincount(classes.root).tolist().__getitem__):
+    classes = _from_guess(apart, links, labels)
+    nodes = np.bincount(classes.root)
+    for root in sorted(np.flatnonzero(classes.known).tolist(), key=lambda root: int(nodes[root])):
         check()
         if classes.known[root]:  # still
             classes.thin(root)
     return classes.labels()
 
 
-def _guessed(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> _Classes:
+def _from_guess(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> _Classes:
     """Nodes that a guess has at one dstate are merged, as far as they can be one; what follows from that is merged, too."""
     first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
     classes = _Classes(apart.copy(), links, first.values())
@@ -144,6 +153,7 @@ class _Classes:
         return True
 
     def unsettled(self) -> NDArray[np.int_]:
+        """The steps of classes that are no known dstates."""
         return np.flatnonzero(~self.known[self.root])
 
     def settle(self, evidence: int, rivals: int, check: Callable[[], None]) -> int:
@@ -176,6 +186,7 @@ class _Classes:
             root = int(self.root[root])
 
     def settle_at_any_rate(self, step: int) -> None:
+        """Merge the class of a step with the known dstate that most speaks for, if it fits any; or make it known."""
         root = int(self.root[step])
         ranked = self._ranked(root, self._fitting(root))
         if ranked:

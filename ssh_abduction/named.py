@@ -12,9 +12,9 @@ reaches it. ∎ A minimal answer that does use a rest is asked for again, with o
 
 Not every step is needed. The control starts with the links of the pinned steps; an answer is followed along the trace, and the links
 at which it fails are added, until one holds everywhere. That is a relaxation until then, so its bounds hold. Where clingo does not
-answer soon, what is missing is rather more knowledge than less, and all links are given at once. Then it is also told which pairs
-of steps are apart, where more than one action shows it: no two of them are at one name. The links say so, too, but only once it is
-chosen where they lead. From then on clasp searches with two threads, which tell each other what they learn.
+answer soon, what is missing is rather more knowledge than less, and all links are given at once. With the steps clingo is told which pairs
+of them are apart, where more than one action shows it: no two of these are at one name. The links say so, too, but only once it is
+chosen where they lead.
 
 Raising the bound by cores stalls when what is missing can be spread over many views: every core is then about all of them. After
 CORES conflicts the numbers of dstates are asked for one by one instead, from the bound up: is there an answer that costs no more? If
@@ -24,6 +24,7 @@ search then goes on with the other maps.
 Beside all that small maps are sought in a thread of its own, or where there is but one processor, first and not for long. First steps are merged by
 evidence (`merging.py`), so that a limit leaves a map that is not bad; then a map is guessed, of places with frames where the trace lets itself be
 taken for one of these (`annealing.py`), and smaller ones are sought near it (`nearby.py`). Whatever bound meets them ends the search.
+Where there is no such search, or it has ended, clasp has the second processor: two threads, which tell each other what they learn.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ from numpy.typing import NDArray
 
 from ssh_abduction import facts
 from ssh_abduction.annealing import annealed, annealed_steps
-from ssh_abduction.apart import apart_from, clique
-from ssh_abduction.chart import Chart, NoFrame, numbered
+from ssh_abduction.apart import apart_from, clique, far_apart
+from ssh_abduction.chart import Chart, Link, NoFrame, numbered
 from ssh_abduction.engine import AT_ONCE, POLL, ChartedEngine, Found, Stopped, Watch
 from ssh_abduction.merging import merged, merged_near, thinned
 from ssh_abduction.nearby import AT_A_TIME, Beside, NearbyEngine, mended
@@ -57,7 +58,6 @@ GUESSES = 10  # that are waited for until one is a map, where the robot does not
 TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside it
 
 
-Link: TypeAlias = tuple[int, int, int]  # node, action, node
 _Trail: TypeAlias = "tuple[Link, _Trail] | None"
 
 
@@ -98,7 +98,7 @@ class NamedEngine(ChartedEngine):
         self.clique = clique(apart, seen[:AT_ONCE]) if self._speedups.clique else [0]
         columns = apart[:, self.clique] if len(seen) <= AT_ONCE else self._columns(self.clique)
         self._may_be = [(~row).nonzero()[0].tolist() for row in columns]
-        self._far = self._chart.far_apart(apart) if self._speedups.apart and len(seen) <= AT_ONCE else None
+        self._far = far_apart(apart, seen, self._log.actions[: size - 1]) if self._speedups.apart and len(seen) <= AT_ONCE else None
         self._one_by_one = self._hard = False
         self._known = None
         self._spares = dict.fromkeys(seen, SPARES)
@@ -215,7 +215,7 @@ class NamedEngine(ChartedEngine):
         guess = self._guessed(check) if self._speedups.annealed else None
         if guess is None:
             return
-        known = thinned(apart, links, merged_near(apart, links, guess, check=check) or guess, check)
+        known = thinned(apart, links, merged_near(apart, links, guess, check), check)
         del apart  # as large as steps x steps
         for labels in engine.fewer(known, tries):
             if len(set(labels)) < fewest:
@@ -228,7 +228,7 @@ class NamedEngine(ChartedEngine):
         except NoFrame:
             guesses: Iterable[list[int]] = islice(annealed_steps(self._chart, self.clique, self._may_be, check), GUESSES)
         else:
-            labels = annealed(chart, check, rough=True).labels(chart)
+            labels = annealed(chart, check).labels(chart)
             guesses = [[labels[node] for node in chart.node_of]]
         guess = None
         for labels in guesses:
@@ -280,6 +280,7 @@ class NamedEngine(ChartedEngine):
         """Raise the bound until there is a map that costs no more. All links are given."""
         self._end_begun()
         while True:
+            self._configure()  # the search beside may have ended
             spares = (self.bound or 0) - len(self.clique)
             answers = self._answers(facts.read_names, f"enum,{spares},{spares}", 0, until=self._settled)
             answer = next(answers, None)
@@ -424,7 +425,7 @@ class NamedEngine(ChartedEngine):
         part, batch = f"batch_{self._batches}", self._batches
         self._control.add(part, [], facts.batch_facts(batch, given, added, far))
         self._control.ground([(part, [])])
-        self._control.ground([("more", facts.step_number(batch))])
+        self._control.ground([("more", facts.numbers(batch))])
         self._batches += 1
         self.ground_seconds += time.perf_counter() - began
 

@@ -27,7 +27,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from itertools import pairwise
 from typing import Any, Literal, TypeAlias
 
 import clingo
@@ -252,7 +251,8 @@ class NearbyEngine(ChartedEngine):
             if not begin:
                 return
             near: dict[int, set[int]] = {}
-            for here, there in pairwise(self._labels):
+            for t, _, u in self._chart.links:
+                here, there = self._labels[t], self._labels[u]
                 near.setdefault(here, set()).add(there)
                 near.setdefault(there, set()).add(here)
             edge = [self._random.choice(begin)]

@@ -85,12 +85,12 @@ class OnlineMapper:
         maps: int = 100,
         speedups: Speedups = ALL,
     ) -> None:
-        if theory and theory.level == "causal":
-            importlib.import_module("ssh_abduction.named")  # now rather than at the step that first needs it, as it takes its time
-        began = time.perf_counter()
         first = Step.of(view, star, "step 0")
         theory = theory or Theory.topological()
         self.theory = theory.resolve(Trace((first,)))
+        engine = "named" if theory.level == "causal" else "framed" if has_frames(self.theory) else "engine"
+        importlib.import_module(f"ssh_abduction.{engine}")  # now rather than at the step that first needs it, as it takes its time
+        began = time.perf_counter()
         self.searches = 0  # how often clingo was asked
         self._without_stars = theory.star == "auto" and self.theory.star == "none"
         self._limit, self._most, self._speedups = limit, maps, speedups

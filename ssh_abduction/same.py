@@ -16,8 +16,8 @@ Kaufmann, Matheis, Schaub 2012, "Unsatisfiability-based optimization in clasp").
 in the end, so these answers are all minimal ones. clasp has that built in, but begins anew with each call, and an answer that
 fails to be transitive is a call. Cores are made small as long as that is cheap: small ones are about one part of the world.
 
-*Near a guess.* Where that takes long, some map is known soon: clingo is asked for answers in which visits are one that `annealing.py` takes
-for one. They need not have the fewest dstates. But where they have as few as the bound, they do.
+*Near a guess.* Where that takes long, some map is known soon: clingo is asked for answers in which visits are one that are one in the map made
+of a guess. They need not have the fewest dstates. But where they have as few as the bound, they do.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class SameEngine(ChartedEngine):
             order = list(range(len(self._chart.seen), len(chart.seen)))
         else:
             chart = self._charted(size)
-            apart = chart.apart(len(chart.seen))
+            apart = chart.apart()
             self._watch.check()
             self.clique = clique(apart, chart.seen) if self._speedups.clique else []
             order = [*self.clique, *sorted(set(range(len(apart))) - set(self.clique), key=lambda node: (-int(apart[node].sum()), node))]

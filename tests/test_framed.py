@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from unittest.mock import patch
 
 import clingo
@@ -30,13 +31,13 @@ from ssh_abduction import (
     solve,
     solver,
 )
-from ssh_abduction.annealing import Guess, annealed
+from ssh_abduction.annealing import Guess, attempts
 from ssh_abduction.chart import QUARTERS, Chart, FramedChart, NoFrame, numbered
 from ssh_abduction.checker import check
 from ssh_abduction.engine import Stopped, Watch
 from ssh_abduction.framed import FramedEngine
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.merging import merged_near
+from ssh_abduction.merging import merged_as_told, merged_near
 from ssh_abduction.nearby import Beside, NearbyEngine
 from ssh_abduction.proof import check_bound
 from ssh_abduction.replay import Log
@@ -275,7 +276,7 @@ def test_apart_nodes_are_different_dstates_of_the_world() -> None:
         chart = engine._charted(len(walk.trace))
         truth = dict(zip(chart.node_of, walk.truth, strict=True))
         assert len(truth) == len(chart.seen)
-        apart = chart.apart(1000)
+        apart = chart.apart()
         assert (apart == apart.T).all()
         assert not any(truth[i] == truth[j] for i, j in zip(*apart.nonzero(), strict=True))
         assert any(truth[i][:2] != truth[j][:2] for i, j in chart.elsewhere)
@@ -512,7 +513,7 @@ def test_annealing_finds_the_places_of_a_maze(seed: int) -> None:
     walk = maze(4, 4, steps=800, seed=seed, stars=True)
     chart = Chart.framed(walk.trace, Log(walk.trace, Theory(star="frame")))
     with patch.object(annealing, "ANNEALED", ((0.5, 500),)):
-        guess = annealed(chart)
+        guess = next(guess for failed, guess in attempts(chart) if not failed)
     assert guess.sure.all()
     guessed = (guess.states // 4).tolist()
     assert len(set(zip(guessed, places(walk, chart), strict=True))) == len(set(guessed)) == len(set(places(walk, chart)))
@@ -526,8 +527,8 @@ def test_a_guess_holds_the_stars(trace: Trace, sweeps: int) -> None:
         chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
     except NoFrame:
         return
-    with patch.multiple(annealing, ANNEALED=((0.5, sweeps),), LAST=1, SECONDS=0.0):
-        guess = annealed(chart)
+    with patch.multiple(annealing, ANNEALED=((0.5, sweeps),), LAST=1):
+        _, guess = next(attempts(chart))
     assert len(guess.states) == len(guess.sure) == len(chart.stars)
     stars: dict[int, tuple[int, ...]] = {}
     for state, star in zip(guess.states.tolist(), chart.stars, strict=True):
@@ -583,11 +584,10 @@ def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[
     except NoFrame:
         return
     chart = asked._chart
-    apart = chart.apart(len(chart.seen))
-    tell = {"tell": lambda *about: asked._told(chart, *about)} if told else {}
-    labels = merged_near(apart, chart.links, guess[: len(chart.seen)], **tell)
+    apart = chart.apart()
+    start = guess[: len(chart.seen)]
+    labels = merged_as_told(apart, chart.links, start, partial(asked._told, chart)) if told else merged_near(apart, chart.links, start)
     if labels is None:
-        assert told
         return
     assert chart.is_map(labels)
     assert not any(apart[i, j] for i in range(len(labels)) for j in range(i) if labels[i] == labels[j])
@@ -604,10 +604,10 @@ def test_a_true_guess_stays_as_it_is(seed: int) -> None:
     asked = framed_engine(walk.trace, Theory.topological())
     chart = asked._chart
     truth = numbered([walk.truth[chart.node_of.index(node)] for node in range(len(chart.seen))])
-    apart = chart.apart(len(chart.seen))
+    apart = chart.apart()
     assert merged_near(apart, chart.links, truth) == truth
     some = [-1 if 20 <= node < 60 else label for node, label in enumerate(truth)]
-    assert merged_near(apart, chart.links, some, lambda *about: asked._told(chart, *about)) == truth
+    assert merged_as_told(apart, chart.links, some, partial(asked._told, chart)) == truth
 
 
 @pytest.mark.parametrize("loops", [0.1, 0.3])
@@ -618,12 +618,12 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float) ->
     chart = asked._charted(len(walk.trace))
     failed: list[int] = []
 
-    def attempts(*arguments: object) -> Iterator[tuple[int, Guess]]:
+    def counted(*arguments: object) -> Iterator[tuple[int, Guess]]:
         for wrong, guess in annealing.attempts(*arguments):  # type: ignore[arg-type]
             failed.append(wrong)
             yield wrong, guess
 
-    with patch.object(annealing, "ANNEALED", ((0.5, 100),)), patch.object(framed, "attempts", attempts):
+    with patch.object(annealing, "ANNEALED", ((0.5, 100),)), patch.object(framed, "attempts", counted):
         labels = asked._guessed_labels(chart, lambda: None)
     assert failed[0] > 0
     assert asked._has_single_streets(chart, labels)

@@ -97,7 +97,7 @@ def test_a_causal_maze_is_guessed_by_its_turns(seed: int) -> None:
     walk = maze(3, 3, steps=1600, seed=seed)
     log = Log(walk.trace, CAUSAL)
     chart = Chart.turned(walk.trace, log, len(log.seen))
-    labels = annealed(chart, rough=True).labels(chart)
+    labels = annealed(chart).labels(chart)
     guess = [labels[node] for node in chart.node_of]
     same = sum(guess[t] >= 0 for t in range(len(guess)))
     assert same > 0.9 * len(guess)
