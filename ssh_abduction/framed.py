@@ -20,11 +20,8 @@ theory is among them.
 
 from __future__ import annotations
 
-import threading
 import time
-import weakref
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,15 +34,14 @@ from ssh_abduction import encodings, facts
 from ssh_abduction.annealing import SECONDS, attempts
 from ssh_abduction.apart import Matrix
 from ssh_abduction.chart import Chart, FramedChart, NoFrame, numbered
-from ssh_abduction.engine import Found, Stopped, Watch, has_processors
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.engine import Found, Watch
 from ssh_abduction.merging import Told, kept, merged_as_told, merged_near
 from ssh_abduction.nearby import Beside, NearbyEngine, mended
 from ssh_abduction.replay import Log
 from ssh_abduction.same import SECONDS_A_PAIR, Pair, SameEngine, TakesLong, smaller
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
-from ssh_abduction.trace import Step, Trace
+from ssh_abduction.trace import Trace
 
 CLASHES = 30  # that clingo is told of in one go
 MANY_DSTATES = 50  # above which it is asked for single streets first
@@ -56,7 +52,7 @@ MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much 
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 KEPT = 10  # controls of minimal namings that are kept until their maps are listed: each is some megabytes
 SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside
-PATIENCE = 5.0  # the same, where that has to be done first
+GUESS_FIRST = 5.0  # the same, where that has to be done first
 GUESSABLE = 1_000_000  # visits that may be one, above which annealing takes too much memory
 LOOSENED = 2  # so many travels, less one, from where a guess cannot be right its places are let free
 GUESSES = 20  # labels that are tried, near what annealing guesses
@@ -151,7 +147,7 @@ class FramedEngine(SameEngine):
         waited = self._watch.elapsed()
         if not self._beside and waited > SOON and self._has_processors():
             self._search_beside(self._chart)
-        return self._guess is not None or (not self._beside and waited > PATIENCE)
+        return self._guess is not None or (not self._beside and waited > GUESS_FIRST)
 
     def _search_beside(self, chart: FramedChart) -> None:
         """Begin to guess in another thread, and to prove from there that the causal axioms need so many dstates."""
@@ -169,9 +165,9 @@ class FramedEngine(SameEngine):
             far=None,
         )
 
-        self._beside = Beside(self._named, watch, self._small_maps(self._named, chart, watch.check))
+        self._beside = Beside(self._named, watch, self._fewer_labels(self._named, chart, watch.check))
 
-    def _small_maps(self, named: NearbyEngine, chart: FramedChart, check: Callable[[], None]) -> Iterator[list[int]]:
+    def _fewer_labels(self, named: NearbyEngine, chart: FramedChart, check: Callable[[], None]) -> Iterator[list[int]]:
         """Labels, each time fewer, of maps of the causal axioms near a guess."""
         self._guess = self._guessed_labels(chart, check)
         yield from named.fewer(self._guess)
@@ -198,7 +194,7 @@ class FramedEngine(SameEngine):
                 return min(found, key=lambda labels: len(set(labels)))
         raise AssertionError
 
-    def guessed(self) -> Found | None:
+    def map_of_guess(self) -> Found | None:
         """A map of the whole trace made of a guess, without a search: None where none is found soon."""
         try:
             self._chart = self._charted(len(self._trace))
@@ -208,7 +204,7 @@ class FramedEngine(SameEngine):
             return None
         return self._single_streets(self._guessed_labels(self._chart, self._watch.check))
 
-    def mended(self, known: Sequence[int]) -> Found | None:
+    def map_mended_from(self, known: Sequence[int]) -> Found | None:
         """A map of the whole trace in which the first steps keep these dstates, as far as can be, and all else is new, if that has streets."""
         chart = self._chart = Chart.framed(self._trace, self._log)
         guess = [-1] * len(chart.seen)
@@ -488,78 +484,6 @@ class FramedEngine(SameEngine):
         control.load(encodings.path("streets"))
         control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
         return control
-
-
-def mended_map(trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None) -> SSHMap | None:
-    """A map of a trace near one of its first steps that its later steps contradict, if there is one in which all that does not fit is new."""
-    watch = watch or Watch(None, None, lambda: None)
-    found = FramedEngine(trace, theory, watch, Log(trace, theory), speedups).mended(known.labels)
-    return found.map if found else None
-
-
-class MapGuess:
-    """A map of a trace that grows, made in a thread of its own. The thread ends when this is no longer referred to, and with the program.
-
-    A map is made of a guess, unless one is known. As the trace has grown meanwhile, and may contradict it, it is mended at the end.
-
-    steps    those of the trace so far; more may be appended
-    may_run  to be cleared where others are in a hurry, as Python runs but one thread at a time
-    """
-
-    def __init__(self, steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None = None) -> None:
-        self.may_run = threading.Event()
-        self._found: Future[SSHMap | None] = Future()
-        watch = _PausedWatch(self.may_run)
-        thread = threading.Thread(target=_guess, args=(steps, theory, speedups, known, watch, self._found), daemon=True)
-        weakref.finalize(self, _end, watch, self.may_run, thread)
-        thread.start()
-
-    @staticmethod
-    def begun(steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None = None) -> MapGuess | None:
-        """None where there is no second processor, or guesses are not wanted."""
-        return MapGuess(steps, theory, speedups, known) if speedups.annealed and has_processors(speedups) else None
-
-    def done(self) -> bool:
-        return self._found.done()
-
-    def map(self) -> SSHMap | None:
-        """The map of the first steps, if one was found. Waits until that is known."""
-        return self._found.result()
-
-
-class _PausedWatch(Watch):
-    """The watch of a search that waits until it may run."""
-
-    def __init__(self, may_run: threading.Event) -> None:
-        super().__init__(None, None, lambda: None)
-        self._may_run = may_run
-
-    def check(self, ahead: float = 0.0) -> None:
-        self._may_run.wait()
-        super().check(ahead)
-
-
-def _guess(
-    steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None, watch: Watch, found: Future[SSHMap | None]
-) -> None:
-    try:
-        if not known:
-            trace = Trace(tuple(steps))
-            guessed = FramedEngine(trace, theory, watch, Log(trace, theory), speedups).guessed()
-            known = guessed.map if guessed else None
-        if known and len(steps) > len(known.labels):
-            known = mended_map(Trace(tuple(steps)), theory, known, speedups, watch)
-        found.set_result(known)
-    except Stopped:
-        found.set_result(None)
-    except BaseException as error:
-        found.set_exception(error)
-
-
-def _end(watch: Watch, may_run: threading.Event, thread: threading.Thread) -> None:
-    watch.interrupted = True
-    may_run.set()
-    thread.join()
 
 
 def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:

@@ -166,7 +166,7 @@ class NamedEngine(ChartedEngine):
                     continue
                 self._add(self._chart.links)
                 self._configure()
-            elif not self._widened(answer):
+            elif not self._named_more(answer):
                 self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
                 labels, failed = self._follow(answer)
                 if not failed:
@@ -193,7 +193,7 @@ class NamedEngine(ChartedEngine):
             far=self._far,
             configuration="tweety",
         )
-        found = self._small_maps(engine, watch.check, None if beside else TRIES)
+        found = self._fewer_labels(engine, watch.check, None if beside else TRIES)
         if beside:
             self._beside = Beside(engine, watch, found)
             return
@@ -204,7 +204,7 @@ class NamedEngine(ChartedEngine):
             self._heed(self._known, engine.bound)
             raise _Settled
 
-    def _small_maps(self, engine: NearbyEngine, check: Callable[[], None], tries: int | None) -> Iterator[list[int]]:
+    def _fewer_labels(self, engine: NearbyEngine, check: Callable[[], None], tries: int | None) -> Iterator[list[int]]:
         """Labels, each time fewer: of a map merged by evidence, of one that is guessed, and of those near that."""
         apart, links = self._chart.apart(AT_ONCE), self._chart.links
         fewest = len(self._chart.seen) + 1
@@ -288,7 +288,7 @@ class NamedEngine(ChartedEngine):
                 self._raise_bound([spares + 1])
             elif self._rests(answer):
                 answers.close()
-                self._widened(answer)
+                self._named_more(answer)
             else:
                 self._begun = answers
                 self._first = answer
@@ -361,7 +361,7 @@ class NamedEngine(ChartedEngine):
         """Take more spare names, if some answer of this cost uses a rest. Says whether it was so."""
         resting = [(facts.resting(self._batches - 1), True)]
         answer = next(self._answers(facts.read_names, f"enum,{spares},{spares}", 1, assumptions=resting), None)
-        return answer is not None and self._widened(answer)
+        return answer is not None and self._named_more(answer)
 
     def _raise_bound(self, costs: Sequence[int]) -> None:
         self.bound = max(self.bound or 0, len(self.clique) + costs[0])
@@ -429,7 +429,7 @@ class NamedEngine(ChartedEngine):
         self._batches += 1
         self.ground_seconds += time.perf_counter() - began
 
-    def _widened(self, answer: dict[int, int]) -> bool:
+    def _named_more(self, answer: dict[int, int]) -> bool:
         """Take more spare names for the views of which the answer uses the rest. Says whether there were any."""
         used = self._rests(answer)
         for view in used:

@@ -30,7 +30,7 @@ holds for the longer trace by (1), and a map. That is a map of fewer steps that 
 consistent; or a sketch of all steps. Where places have frames, a map that is contradicted is mended: what does not fit is something new. clingo is asked again when the trace is longer by RETRY and PAUSE; it goes on where it was stopped, and may
 prove a map minimal again.
 
-Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`framed.py`), one after another, in a thread of their own,
+Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`guessing.py`), one after another, in a thread of their own,
 and mended there where that takes longer than a step may.
 """
 
@@ -54,7 +54,7 @@ from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Step, Trace, View
 
 if TYPE_CHECKING:
-    from ssh_abduction.framed import MapGuess
+    from ssh_abduction.guessing import MapGuess
 
 RETRY = 1.01  # after a search that was stopped, the trace grows by this factor before the next, so that few steps are slow,
 PAUSE = 2  # and by so many steps at least
@@ -88,7 +88,7 @@ class OnlineMapper:
         first = Step.of(view, star, "step 0")
         theory = theory or Theory.topological()
         self.theory = theory.resolve(Trace((first,)))
-        engine = "named" if theory.level == "causal" else "framed" if has_frames(self.theory) else "engine"
+        engine = "named" if theory.level == "causal" else "guessing" if has_frames(self.theory) else "engine"
         importlib.import_module(f"ssh_abduction.{engine}")  # now rather than at the step that first needs it, as it takes its time
         began = time.perf_counter()
         self.searches = 0  # how often clingo was asked
@@ -197,7 +197,7 @@ class OnlineMapper:
         steps, now = len(self._steps), time.perf_counter()
         if now - began + self._mending * steps**2 > self._limit:
             return False
-        from ssh_abduction.framed import mended_map  # loads numpy
+        from ssh_abduction.guessing import mended_map  # loads numpy
 
         mended = mended_map(self.trace, self.theory, ssh_map, self._speedups)
         self._mending = (time.perf_counter() - now) / steps**2
@@ -230,7 +230,7 @@ class OnlineMapper:
 
     def _begin_guess(self, known: SSHMap | None) -> None:
         """Begin a guess where no map is known to be minimal, or let a map that is contradicted be mended."""
-        from ssh_abduction.framed import MapGuess  # loads numpy
+        from ssh_abduction.guessing import MapGuess  # loads numpy
 
         if not known:
             self._next_guess = int(GUESS_AGAIN * len(self._steps))

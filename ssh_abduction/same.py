@@ -38,7 +38,7 @@ from ssh_abduction.trace import Trace
 
 SECONDS_A_PAIR = 3e-5  # what clingo takes, about, to ground two visits that may be one: it cannot be stopped meanwhile
 AT_A_TIME = 20_000  # threes of visits that clingo is told of in one go
-TRIES = 100  # conflicts after which it is left open whether a core can be smaller
+TRY_CONFLICTS = 100  # conflicts after which it is left open whether a core can be smaller
 FAILED_TRIES = 20  # tries after which a core is kept as it is
 GROWN = 1.1  # how many times as many nodes as at first a control may have, before a new one is taken with a better order
 MANY = 5  # answers found one by one, after which they are looked for nearby
@@ -185,7 +185,7 @@ class SameEngine(ChartedEngine):
 
     def _smaller(self, core: list[int]) -> list[int]:
         """A core of fewer members, as long as that is cheap."""
-        return smaller(core, lambda part: self._verdict(lambda _: None, part, TRIES)[1], FAILED_TRIES)
+        return smaller(core, lambda part: self._verdict(lambda _: None, part, TRY_CONFLICTS)[1], FAILED_TRIES)
 
     def _relax(self, core: Sequence[int]) -> None:
         """As not all members of a core can be avoided, ask only that no two of them are there."""
@@ -261,7 +261,7 @@ class SameEngine(ChartedEngine):
         """Of places that cannot all be as guessed, few that cannot."""
 
         def impossible(some: list[int]) -> list[int] | None:
-            core = self._verdict(lambda _: None, [literal for literal, place in place_of.items() if place in some], TRIES)[1]
+            core = self._verdict(lambda _: None, [literal for literal, place in place_of.items() if place in some], TRY_CONFLICTS)[1]
             return None if core is None else sorted({place_of[literal] for literal in core})
 
         return smaller(places, impossible, FAILED_TRIES)

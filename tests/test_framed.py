@@ -111,7 +111,7 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         "AT_A_TIME": data.draw(st.sampled_from([1, same.AT_A_TIME]), label="at a time"),
         "MANY": data.draw(st.sampled_from([1, 2, same.MANY]), label="many"),
         "FAR": data.draw(st.sampled_from([0, same.FAR]), label="far"),
-        "TRIES": data.draw(st.sampled_from([0, same.TRIES]), label="tries"),
+        "TRY_CONFLICTS": data.draw(st.sampled_from([0, same.TRY_CONFLICTS]), label="tries"),
         "FAILED_TRIES": data.draw(st.sampled_from([1, same.FAILED_TRIES]), label="failed tries"),
     }
     streets = {
@@ -119,7 +119,7 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         "CLASHES": data.draw(st.sampled_from([1, framed.CLASHES]), label="clashes"),
         "MANY_PAIRS": data.draw(st.sampled_from([5, framed.MANY_PAIRS]), label="many pairs"),
         "GUESSES": data.draw(st.sampled_from([1, framed.GUESSES]), label="guesses"),
-        "PATIENCE": data.draw(st.sampled_from([-1.0, framed.PATIENCE]), label="patience"),
+        "GUESS_FIRST": data.draw(st.sampled_from([-1.0, framed.GUESS_FIRST]), label="patience"),
         "SOON": data.draw(st.sampled_from([-1.0, framed.SOON]), label="soon"),
         "MANY_DSTATES": data.draw(st.sampled_from([0, framed.MANY_DSTATES]), label="many dstates"),
     }
@@ -641,7 +641,7 @@ def test_a_guess_leaves_a_small_map_when_time_is_over() -> None:
         return asked(self, until)
 
     with (
-        patch.object(framed, "PATIENCE", -1.0),
+        patch.object(framed, "GUESS_FIRST", -1.0),
         patch.object(FramedEngine, "_has_processors", lambda _: False),
         patch.object(FramedEngine, "_minimal_labels", interrupted),
     ):

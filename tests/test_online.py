@@ -15,7 +15,7 @@ from instances import maze
 from strategies import theories, traces
 from worlds import TOURS, drive, rectangle
 
-from ssh_abduction import Action, OnlineMapper, Solution, Status, Theory, TheoryError, Trace, TraceError, framed, online, solve
+from ssh_abduction import Action, OnlineMapper, Solution, Status, Theory, TheoryError, Trace, TraceError, guessing, online, solve
 from ssh_abduction.chart import Chart
 from ssh_abduction.checker import check
 from ssh_abduction.replay import Log
@@ -198,7 +198,7 @@ def test_maps_are_guessed_while_the_robot_drives() -> None:
     """Without time for clingo. The guess is made for some of the steps; its map goes on."""
     walk = maze(4, 4, steps=220, seed=1, stars=True)
     trace = walk.trace
-    with patch.object(framed, "has_processors", lambda _: True), patch.object(online, "GUESSED", 200):
+    with patch.object(guessing, "has_processors", lambda _: True), patch.object(online, "GUESSED", 200):
         mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, limit=NO_TIME)
         explore(trace.prefix(205), mapper)
         assert mapper._guess is not None
@@ -220,7 +220,7 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
         known = solve(trace.prefix(first), theory, maps=1).maps[0]
         predicted = Log(trace, theory).replay(known.labels).labels
         for steps in (min(len(predicted), len(trace)), min(len(predicted) + 1, len(trace)), min(len(predicted) + 20, len(trace))):
-            found = framed.mended_map(trace.prefix(steps), theory, known, Speedups())
+            found = guessing.mended_map(trace.prefix(steps), theory, known, Speedups())
             if found is None:
                 without += 1
                 continue
@@ -245,8 +245,8 @@ def test_a_guess_ends_with_its_mapper_and_with_the_program() -> None:
     program = """
 import threading
 from instances import maze
-from ssh_abduction import OnlineMapper, framed
-framed.has_processors = lambda _: True
+from ssh_abduction import OnlineMapper, guessing
+guessing.has_processors = lambda _: True
 
 def begun():
     trace = maze(10, 10, steps=150, seed=1, stars=True).trace
