@@ -34,6 +34,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any, TypeAlias
 
+import clingo
 import numpy as np
 from numpy.typing import NDArray
 
@@ -297,7 +298,7 @@ class NamedEngine(ChartedEngine):
     def _all_of_bound(self, spares: int) -> Iterator[dict[int, int]]:
         """All answers of this cost that use no rest, where a search for them has begun from there on."""
         if self._begun is None:
-            yield from self._answers(facts.read_names, f"enum,{spares},0", 0)
+            yield from self._answers(facts.read_names, f"enum,{spares},0", 0, assumptions=[self._resting(False)])
             return
         begun, self._begun = self._begun, None
         yield self._first
@@ -359,9 +360,12 @@ class NamedEngine(ChartedEngine):
 
     def _needs_rest(self, spares: int) -> bool:
         """Take more spare names, if some answer of this cost uses a rest. Says whether it was so."""
-        resting = [(facts.resting(self._batches - 1), True)]
-        answer = next(self._answers(facts.read_names, f"enum,{spares},{spares}", 1, assumptions=resting), None)
+        answer = next(self._answers(facts.read_names, f"enum,{spares},{spares}", 1, assumptions=[self._resting(True)]), None)
         return answer is not None and self._named_more(answer)
+
+    def _resting(self, value: bool) -> tuple[clingo.Symbol, bool]:
+        """The assumption that some node is at a rest, or that none is."""
+        return facts.resting(self._batches - 1), value
 
     def _raise_bound(self, costs: Sequence[int]) -> None:
         self.bound = max(self.bound or 0, len(self.clique) + costs[0])

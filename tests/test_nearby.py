@@ -9,10 +9,10 @@ from unittest.mock import Mock, patch
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from instances import maze
+from instances import maze, moore
 from test_speedups import PLAIN, machines
 
-from ssh_abduction import Speedups, Status, Theory, Trace, engine, facts, named, nearby, solve, solver
+from ssh_abduction import Speedups, Status, Theory, Trace, annealing, engine, facts, named, nearby, solve, solver
 from ssh_abduction.annealing import annealed
 from ssh_abduction.apart import apartness, clique, far_apart
 from ssh_abduction.chart import Chart, NoFrame
@@ -89,6 +89,19 @@ def test_a_search_beside_another_changes_no_answer(trace: Trace, beside: bool, c
     assert set(found.maps) <= set(expected.maps)
     assert found.count == len(set(found.maps)) == (min(most, expected.count) if most else expected.count)
     assert found.complete == (not most or expected.count <= most)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> None:
+    """Then names may still be fewer than dstates: what is at a rest is no map."""
+    trace = moore(7, 2, steps=60, seed=seed).trace
+    with patch.multiple(named, PATIENCE=1, GUESSES=1), patch.object(annealing, "STEPS", ((0.75, 100),)):
+        some, every = (solve(trace, CAUSAL, maps=most, limit=60, speedups=Speedups.without("clique,threads,prefixes")) for most in (5, 100))
+    assert some.count == min(5, every.count)
+    assert set(some.maps) <= set(every.maps) or every.count == 100
+    for ssh_map in (*some.maps, *every.maps):
+        assert check(trace, ssh_map, CAUSAL) == ()
+        assert len(ssh_map.dstates) == every.bound.dstates
 
 
 @pytest.mark.parametrize("seed", [0, 1])
