@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import pairwise
 
 from clingo import Function, Model, Number, String, Symbol, SymbolType
@@ -246,6 +246,12 @@ def same(pair: tuple[int, int, int]) -> Symbol:
     return Function("same", numbers(*pair))
 
 
+def read_same(atom: Symbol) -> tuple[int, int, int]:
+    """The two visits, and how turned, of such an atom."""
+    first, second, turned = (argument.number for argument in atom.arguments)
+    return first, second, turned
+
+
 def listed(batch: int) -> Symbol:
     """The external atom that answers for the batches up to this one are listed."""
     return Function("listed", [Number(batch)])
@@ -284,9 +290,12 @@ def forbidden_pairs(
     return f":- {', '.join(body if listed is None else [f'listed({listed})', *body])}."
 
 
+_number = cache(Number)  # half the time of a symbol, where there are many
+
+
 def numbers(*arguments: int) -> list[Symbol]:
     """The arguments of a program part."""
-    return [Number(argument) for argument in arguments]
+    return [_number(argument) for argument in arguments]
 
 
 def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:

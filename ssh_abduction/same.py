@@ -102,7 +102,8 @@ class SameEngine(ChartedEngine):
         self._fits: frozenset[Pair] = frozenset()
         self._least = 0
         self._avoided: dict[int, clingo.Symbol] = {}  # what is assumed not to be there, by the literal of that
-        self._pair_of: dict[clingo.Symbol, Pair] = {}
+        self._pair_of = _PairOf()
+        self._unread: list[Pair] = []  # whose literals were not asked for yet
         self._transitive = _Transitive()
         self._control.register_propagator(self._transitive)
         self._core_sizes: list[int] = []
@@ -133,10 +134,7 @@ class SameEngine(ChartedEngine):
             elif atom:
                 self._avoided[-atom.literal] = atom.symbol
         self._raise_bound()
-        for pair in new:
-            if atom := atoms[facts.same(pair)]:
-                self._pair_of[atom.symbol] = pair
-                self._transitive.literals[pair] = atom.literal
+        self._unread += new
         self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
         self._excluded = 0  # so many of them clingo will not find again
         self._known: tuple[int, ...] | None = None  # labels of a map
@@ -182,6 +180,14 @@ class SameEngine(ChartedEngine):
 
     def _pairs(self, model: clingo.Model) -> list[Pair]:
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
+
+    def _read_literals(self) -> None:
+        """Look up the literals that two visits are one: that takes seconds where there are many, and is seldom needed."""
+        atoms = self._control.symbolic_atoms
+        for pair in self._unread:
+            if atom := atoms[facts.same(pair)]:
+                self._transitive.literals[pair] = atom.literal
+        self._unread = []
 
     def _smaller(self, core: list[int]) -> list[int]:
         """A core of fewer members, as long as that is cheap."""
@@ -233,6 +239,7 @@ class SameEngine(ChartedEngine):
         states = _states(self._chart, guess)
         place_of: dict[int, int] = {}  # by the literal that two of its visits are one
         avoided: set[int] = set()
+        self._read_literals()
         for (i, j, r), literal in self._transitive.literals.items():
             if states[i] // 4 == states[j] // 4 and (states[i] - states[j]) % 4 == r:
                 place_of[literal] = states[i] // 4
@@ -299,6 +306,7 @@ class SameEngine(ChartedEngine):
             return self._labels(self._pairs(model))
 
         excluded = set(self._found[self._excluded :])
+        self._read_literals()
         self._transitive.asked, self._transitive.failed = True, 0
         mode, assumed = self._asking_for(dstates)
         answers = self._answers(read, mode, 0, assumptions=assumed, until=lambda: self._transitive.failed > FAR)
@@ -421,6 +429,14 @@ def smaller(members: list[int], shrunk: Callable[[list[int]], list[int] | None],
             if failed == tries:
                 return members
     return members
+
+
+class _PairOf(dict[clingo.Symbol, Pair]):
+    """The visits that atoms say are one, each atom read once."""
+
+    def __missing__(self, symbol: clingo.Symbol) -> Pair:
+        pair = self[symbol] = facts.read_same(symbol)
+        return pair
 
 
 class _Transitive(clingo.Propagator):
