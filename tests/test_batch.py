@@ -142,7 +142,7 @@ def test_wrong_choices_are_one_line(traces: Path, monkeypatch: pytest.MonkeyPatc
         (["-", "--jobs", "2"], r"-: expected files .* got standard input; save it to a file"),
         ([*both, "--theory", "causal", "--boundary", "strict"], r"boundary: expected none with level=causal.*"),
         ([*both, "--scheduler", nobody], rf"--scheduler: expected a Dask scheduler at {nobody}, got none \(.*\); start one with: .*"),
-        ([*both, "--scheduler", "elsewhere"], r"--scheduler: expected a Dask scheduler at elsewhere, got none \(missing port.*"),
+        ([*both, "--scheduler", "elsewhere"], r"--scheduler: expected an address with a port, such as tcp://host:8786, got 'elsewhere'"),
     ):
         assert main(["solve", *words]) == 1
         out, err = capsys.readouterr()

@@ -137,6 +137,7 @@ def test_a_step_that_may_be_another_is_a_fault() -> None:
         ({"clique": [0, 0]}, "different steps"),
         ({"clique": [1000]}, "different steps"),
         ({"clique": "all"}, "different steps"),
+        ({"clique": None}, "different steps"),
         ({"refuted": [3]}, "without a gap"),
         ({"words": [[0, 1]]}, "expected \\[step, step"),
         ({"words": 7}, "expected \\[step, step"),
@@ -146,6 +147,11 @@ def test_malformed_certificates_are_errors(change: dict[str, Any], word: str) ->
     trace, data = certified()
     with pytest.raises(MapError, match=word):
         check_bound(trace, {**data, **change})
+
+
+def test_a_certificate_says_its_clique() -> None:
+    with pytest.raises(MapError, match="clique: expected one"):
+        check_bound(certified()[0], {})
 
 
 def test_check_bound_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -158,6 +164,12 @@ def test_check_bound_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
     data = json.loads(maps.read_text())
     assert f"at least {len(data['certificate']['clique'])} dstates: as many steps" in shown
     assert f"the maps have {data['cost']['dstates']}: no map has fewer" in shown
+    refuted = data["certificate"]["refuted"]
+    data["certificate"]["refuted"] = list(range(len(data["certificate"]["clique"]), data["cost"]["dstates"] + 1))
+    maps.write_text(json.dumps(data))
+    assert main(["check", "--bound", str(trace), str(maps)]) == 20
+    assert "fewer than that, so this bound or a map is wrong" in capsys.readouterr().out
+    data["certificate"]["refuted"] = refuted
     data["certificate"]["clique"][0] += 1
     maps.write_text(json.dumps(data))
     assert main(["check", "--bound", str(trace), str(maps)]) == 20

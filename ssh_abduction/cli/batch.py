@@ -10,6 +10,7 @@ import contextlib
 import ctypes
 import gc
 import logging
+import re
 import sys
 import threading
 import warnings
@@ -25,7 +26,7 @@ from ssh_abduction.cli import EXIT_ERROR, EXIT_INTERRUPTED
 from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.solve import dump, ending, exit_code, explained, on_ctrl_c, opening
 from ssh_abduction.cli.text import headline
-from ssh_abduction.errors import SolverError, SSHError, named
+from ssh_abduction.errors import SolverError, SSHError, brief, named
 from ssh_abduction.solver import Search
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
@@ -159,6 +160,8 @@ def _on_cluster(question: Question, paths: Sequence[str], address: str, jobs: in
         from distributed import Client
     except ImportError:
         raise SSHError("--scheduler: expected the package distributed, got none; pip install 'ssh-abduction[cluster]'") from None
+    if not re.search(r"^inproc:|:\d+$", address):
+        raise SSHError(f"--scheduler: expected an address with a port, such as tcp://host:8786, got {brief(address)}")
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what goes wrong is in the answers
     warnings.filterwarnings("ignore", "Sending large graph")  # a long trace goes to one worker, once
     try:

@@ -64,5 +64,6 @@ def _bound(trace: Trace, data: Any, theory: Theory, fewest: int | None) -> bool:
         sizes = f"{bound.refuted[0]} to {total - 1}" if len(bound.refuted) > 1 else str(bound.refuted[0])
         print(f"at least {total} dstates, if clingo is right that there is no map of {sizes}")
     if fewest is not None:
-        print(f"the maps have {fewest}" + (": no map has fewer" if fewest == total else f", {fewest - total} more than proven"))
+        beyond = "fewer than that, so this bound or a map is wrong" if fewest < total else f"{fewest - total} more than proven"
+        print(f"the maps have {fewest}" + (": no map has fewer" if fewest == total else f", {beyond}"))
     return fewest is None or fewest >= total
