@@ -28,6 +28,7 @@ from dataclasses import replace
 from typing import Self, TypeAlias
 
 import clingo
+import numpy as np
 
 from ssh_abduction import facts
 from ssh_abduction.apart import clique
@@ -361,7 +362,9 @@ class SameEngine(ChartedEngine):
         found: dict[Three, None] = {}
         turned: _Turned = {}
         leaves = self._chart.leaves
-        work = list(pairs)
+        work = _scattered(pairs, len(self._chart.stars))
+        if not work:
+            return []
         for pair in pairs:
             _take(turned, pair)
         for i, j, r in work:
@@ -482,6 +485,21 @@ class _Transitive(clingo.Propagator):
             for i, j, _ in self._watched.get(literal, ()):
                 self._turned.get(i, {}).pop(j, None)
                 self._turned.get(j, {}).pop(i, None)
+
+
+def _scattered(pairs: Sequence[Pair], visits: int) -> list[Pair]:
+    """The pairs of an answer but those of visits each of which is one with all others that any is one with, turned as these say."""
+    first, second, turns = np.array(pairs, dtype=int).reshape(-1, 3).T
+    group = np.arange(visits)  # the first visit that each is one with
+    np.minimum.at(group, second, first)
+    turned = np.zeros(visits, dtype=int)  # the slot that slot 0 of that visit is
+    at_first = group[second] == first
+    turned[second[at_first]] = turns[at_first]
+    members, joined = np.bincount(group, minlength=visits), np.bincount(group[first], minlength=visits)
+    wrong = (group[first] != group[second]) | ((turned[second] - turned[first]) % 4 != turns)
+    scattered = joined != members * (members - 1) // 2
+    scattered[group[first[wrong]]] = scattered[group[second[wrong]]] = True
+    return [pair for pair, bad in zip(pairs, scattered[group[first]] | scattered[group[second]], strict=True) if bad]
 
 
 def _take(turned: _Turned, pair: Pair) -> None:
