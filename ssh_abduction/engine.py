@@ -55,10 +55,20 @@ class Stopped(Exception):  # noqa: N818 - not an error
 class Watch:
     """The limits of a search: `check` raises when one is over. Time that the caller of a stream takes does not count.
 
-    beside  the watch of the search that this one is beside. That ends it, and what cannot be interrupted is not begun where too little time is left
+    limit    seconds, or None
+    memory   MiB that the process may use, or None
+    on_tick  called now and then
+    beside  the watch of the search that this one is beside: that one ends it, and what cannot be interrupted is not begun where too little time is left
     """
 
-    def __init__(self, limit: float | None, memory: int | None, on_tick: Callable[[], None], *, beside: Watch | None = None) -> None:
+    def __init__(
+        self,
+        limit: float | None = None,
+        memory: int | None = None,
+        on_tick: Callable[[], None] = lambda: None,
+        *,
+        beside: Watch | None = None,
+    ) -> None:
         self._beside = beside
         self._on_tick = on_tick
         self._next_tick = TICK

@@ -151,7 +151,7 @@ class FramedEngine(SameEngine):
 
     def _search_beside(self, chart: FramedChart) -> None:
         """Begin to guess in another thread, and to prove from there that the causal axioms need so many dstates."""
-        watch, pinned = Watch(None, None, lambda: None, beside=self._watch), self.clique or [0]
+        watch, pinned = Watch(beside=self._watch), self.clique or [0]
         apart = chart.apart(others=pinned)
         self._named = NearbyEngine(
             self._trace,
@@ -213,6 +213,7 @@ class FramedEngine(SameEngine):
         return self._single_streets(kept(chart.apart(), chart.links, guess))
 
     def _has_single_streets(self, chart: FramedChart, labels: Sequence[int]) -> bool:
+        """Whether these labels have streets, as far as single ones tell. Takes so little time that no limit has to stop it."""
         return bool(self._settled_streets(chart, labels, single=True).solve().satisfiable)
 
     def _told(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:

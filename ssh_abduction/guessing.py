@@ -21,7 +21,7 @@ from ssh_abduction.trace import Step, Trace
 
 def mended_map(trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None) -> SSHMap | None:
     """A map of a trace near one of its first steps that its later steps contradict, if there is one in which all that does not fit is new."""
-    watch = watch or Watch(None, None, lambda: None)
+    watch = watch or Watch()
     found = FramedEngine(trace, theory, watch, Log(trace, theory), speedups).map_mended_from(known.labels)
     return found.map if found else None
 
@@ -60,7 +60,7 @@ class _PausedWatch(Watch):
     """The watch of a search that waits until it may run."""
 
     def __init__(self, may_run: threading.Event) -> None:
-        super().__init__(None, None, lambda: None)
+        super().__init__()
         self._may_run = may_run
 
     def check(self, ahead: float = 0.0) -> None:

@@ -181,7 +181,7 @@ class NamedEngine(ChartedEngine):
         if len(self._chart.seen) > AT_ONCE or not (self._speedups.greedy or self._speedups.annealed):
             return
         beside = self._has_processors()
-        watch = Watch(None, None, lambda: None, beside=self._watch) if beside else self._watch
+        watch = Watch(beside=self._watch) if beside else self._watch
         engine = NearbyEngine(
             self._trace,
             self._theory,

@@ -44,7 +44,8 @@ from ssh_abduction.trace import Trace
 CONFLICTS = 2000  # after which a question is left open, at first; then twice as many
 WIDE = 10  # as many times as many, where nothing is assumed of steps
 REGIONS = 40  # parts of the map that are drawn anew in vain, before anything else is tried
-FIRST_REGION = 10  # dstates of such a part, at first
+FIRST_REGION = 10  # dstates of such a part, at first and at least
+LARGER, SMALLER = 2, 4  # dstates that it gets more where it cannot have fewer, and less where that was left open
 PREPARING = 1.0  # times as long as grounding took, about, clingo prepares to solve, and cannot be stopped
 AT_A_TIME = 100  # links that clingo is given in one go
 
@@ -268,9 +269,9 @@ class NearbyEngine(ChartedEngine):
                 yield self._labels
                 tried = 0
             elif core is not None:
-                self._region = min(self._region + 2, len(taken))
+                self._region = min(self._region + LARGER, len(taken))
             else:
-                self._region = max(self._region - 4, FIRST_REGION)
+                self._region = max(self._region - SMALLER, FIRST_REGION)
 
     def _widened(self, conflicts: int) -> Generator[Labels, None, _Verdict]:
         """Labels with fewer dstates, if allowing more names leads to some; "needed" if there are none whatever is allowed."""

@@ -58,6 +58,7 @@ class SameEngine(ChartedEngine):
     """Which visits are one, so that dstates are fewest."""
 
     _chart: FramedChart
+    _known: tuple[int, ...] | None  # labels of a map; set by who finds one near a guess
 
     def over(self, trace: Trace, watch: Watch, log: Log) -> Self:
         self._trace, self._watch, self._log = trace, watch, log
@@ -138,7 +139,7 @@ class SameEngine(ChartedEngine):
         self._unread += new
         self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
         self._excluded = 0  # so many of them clingo will not find again
-        self._known: tuple[int, ...] | None = None  # labels of a map
+        self._known = None
 
     def _raise_bound(self) -> None:
         self.bound = max(self.bound or 0, self._least)

@@ -563,7 +563,7 @@ def loosened_labels(draw: st.DrawFn, labels: Sequence[int]) -> list[int]:
 
 def framed_engine(trace: Trace, theory: Theory) -> FramedEngine:
     resolved = theory.resolve(trace)
-    watch = Watch(None, None, lambda: None)
+    watch = Watch()
     watch.start()
     found = FramedEngine(trace, resolved, watch, Log(trace, resolved), Speedups())
     found._chart = Chart.framed(trace, found._log, len(trace))

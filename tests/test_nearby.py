@@ -31,7 +31,7 @@ def nearby_engine(trace: Trace) -> NearbyEngine:
     pinned = clique(apart, log.seen)
     may_be = [[pinned.index(t)] if t in pinned else (~row[pinned]).nonzero()[0].tolist() for t, row in enumerate(apart)]
     far = far_apart(apart.copy(), log.seen, log.actions)
-    watch = Watch(None, None, lambda: None)
+    watch = Watch()
     watch.start()
     return NearbyEngine(
         trace,
@@ -196,7 +196,7 @@ def test_what_goes_wrong_in_the_thread_is_raised_where_the_result_is_asked_for()
         yield [0, 1, 0, 1]
         raise ZeroDivisionError
 
-    beside = Beside(nearby_engine(trace), Watch(None, None, lambda: None), found())
+    beside = Beside(nearby_engine(trace), Watch(), found())
     while beside.running:
         time.sleep(0.001)
     with pytest.raises(ZeroDivisionError):
