@@ -45,7 +45,7 @@ from ssh_abduction.trace import Trace
 
 CLASHES = 30  # that clingo is told of in one go
 MANY_DSTATES = 50  # above which it is asked for single streets first
-ALL_STREETS = 15  # times as long as single ones, about, all take to ground
+ALL_STREETS = 20  # times as long as single ones, about, all take to ground
 PREPARED = 2.5  # times as long, until clasp has prepared to solve and can be stopped
 MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much to say: some forty rules for each of them
 # clasp's way to list answers in which no atom that is shown can be spared:
@@ -91,6 +91,7 @@ class FramedEngine(SameEngine):
             self._best = None
             self._end_beside()
             self._guess, self._guessed, self._named, self._tried = None, False, None, None
+            self._street_seconds = 0.0
         try:
             super().grow(size)
         except NoFrame:
@@ -375,12 +376,12 @@ class FramedEngine(SameEngine):
     ) -> clingo.Control:
         """A control for the streets that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
         self._watch.check(0.0 if single else PREPARED * self._street_seconds)
-        began = time.perf_counter()
+        began, worked = time.perf_counter(), time.thread_time()
         control = self._settled_streets(self._chart, labels, options, nodes, single=single)
         self._watch.check()
-        seconds = time.perf_counter() - began
+        seconds = time.thread_time() - worked  # of this thread: the one beside may have made it wait
         self._street_seconds = self._street_seconds or ALL_STREETS * seconds if single else seconds
-        self.ground_seconds += seconds
+        self.ground_seconds += time.perf_counter() - began
         return control
 
     def _settled_streets(
