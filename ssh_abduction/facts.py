@@ -75,12 +75,12 @@ def program(trace: Trace, theory: Theory) -> str:
 
 def query(t: int) -> Symbol:
     """The external atom that makes t the last step."""
-    return Function("query", [Number(t)])
+    return Function("query", numbers(t))
 
 
 def active(axiom: str, t: int) -> Symbol:
     """The atom of an explanation that makes an axiom hold at step t."""
-    return Function("active", [Function(axiom), Number(t)])
+    return Function("active", [Function(axiom), *numbers(t)])
 
 
 def _constant(value: str | int) -> str:
@@ -206,7 +206,7 @@ def watched() -> Symbol:
 
 def resting(batch: int) -> Symbol:
     """The atom that holds if a step of the batches up to this one is at the rest of its view. Assumed by who asks for such a map."""
-    return Function("resting", [Number(batch)])
+    return Function("resting", numbers(batch))
 
 
 def ordered() -> Symbol:
@@ -216,12 +216,12 @@ def ordered() -> Symbol:
 
 def named(t: int, name: int) -> Symbol:
     """The atom that step t is at the dstate of that name."""
-    return Function("is", [Number(t), Number(name)])
+    return Function("is", numbers(t, name))
 
 
 def used(name: int) -> Symbol:
     """The atom that a spare name is used."""
-    return Function("used", [Number(name)])
+    return Function("used", numbers(name))
 
 
 def read_names(model: Model) -> dict[int, int]:
@@ -254,12 +254,12 @@ def read_same(atom: Symbol) -> tuple[int, int, int]:
 
 def listed(batch: int) -> Symbol:
     """The external atom that answers for the batches up to this one are listed."""
-    return Function("listed", [Number(batch)])
+    return Function("listed", numbers(batch))
 
 
 def alone(place: int) -> Symbol:
     """The atom that the node at this place of the order is the first at its dstate."""
-    return Function("alone", [Number(place)])
+    return Function("alone", numbers(place))
 
 
 def over(core: int, count: int) -> Symbol:
@@ -294,7 +294,7 @@ _number = cache(Number)  # half the time of a symbol, where there are many
 
 
 def numbers(*arguments: int) -> list[Symbol]:
-    """The arguments of a program part."""
+    """Numbers as the arguments of a program part, or of an atom."""
     return [_number(argument) for argument in arguments]
 
 

@@ -271,7 +271,7 @@ class FramedEngine(SameEngine):
 
     def _bettered(self) -> Iterator[Found]:
         """The known map with better streets, unless these were looked for already, or there is no time for that."""
-        if self._known and self._known_cost and len(self._theory.priorities) > 1 and self._watch.allows(PREPARED * self._street_seconds):
+        if self._known and self._known_cost and len(self._theory.priorities) > 1 and self._watch.allows(self._preparing):
             cost, self._known_cost = self._known_cost, ()
             yield from (found for found in self._streets(_Naming(list(self._known), None), "opt", GUESSING) if found.cost < cost)
 
@@ -371,16 +371,21 @@ class FramedEngine(SameEngine):
 
         return (yield from self._answers(read, mode, int(mode == "ignore"), control=control, conflicts=conflicts))
 
+    @property
+    def _preparing(self) -> float:
+        """Seconds, about, until clingo can be stopped that is asked for all streets."""
+        return PREPARED * self._street_seconds
+
     def _street_control(
         self, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None, *, single: bool = False
     ) -> clingo.Control:
         """A control for the streets that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
-        self._watch.check(0.0 if single else PREPARED * self._street_seconds)
+        self._watch.check(0.0 if single else self._preparing)
         began, worked = time.perf_counter(), time.thread_time()
         control = self._settled_streets(self._chart, labels, options, nodes, single=single)
         self._watch.check()
         seconds = time.thread_time() - worked  # of this thread: the one beside may have made it wait
-        self._street_seconds = self._street_seconds or ALL_STREETS * seconds if single else seconds
+        self._street_seconds = (self._street_seconds or ALL_STREETS * seconds) if single else seconds
         self.ground_seconds += time.perf_counter() - began
         return control
 

@@ -24,7 +24,7 @@ search then goes on with the other maps.
 Beside all that small maps are sought in a thread of its own, or where there is but one processor, first and not for long. First steps are merged by
 evidence (`merging.py`), so that a limit leaves a map that is not bad; then a map is guessed, of places with frames where the trace lets itself be
 taken for one of these (`annealing.py`), and smaller ones are sought near it (`nearby.py`). Whatever bound meets them ends the search.
-Where there is no such search, or it has ended, clasp has the second processor: two threads, which tell each other what they learn.
+Where there is no such search, clasp has the second processor: two threads, which tell each other what they learn.
 """
 
 from __future__ import annotations
@@ -129,11 +129,7 @@ class NamedEngine(ChartedEngine):
             yield [0]
             return
         try:
-            try:
-                yield from self._searched()
-            except Stopped:
-                self._outlasted()
-                raise
+            yield from self._searched()
         except _Settled:
             self._end_beside()
             yield self._known or []
@@ -247,13 +243,15 @@ class NamedEngine(ChartedEngine):
                 raise _Settled
         return False
 
-    def _outlasted(self) -> None:
-        """Let the search beside this one use what time is left, where clingo was not asked as it would have taken too long to prepare."""
-        while self._beside is not None and self._beside.running:
-            self._watch.check()
+    def _check_ahead(self, seconds: float) -> None:
+        """Raise Stopped where no time is left for so many seconds of what cannot be interrupted; but first let the search beside this one use it."""
+        if not self._watch.allows(seconds):
+            while self._beside is not None and self._beside.running:
+                self._watch.check()
+                self._settled()
+                time.sleep(POLL)
             self._settled()
-            time.sleep(POLL)
-        self._settled()
+        self._watch.check(seconds)
 
     def _end_beside(self) -> None:
         if self._beside is not None:
@@ -281,7 +279,6 @@ class NamedEngine(ChartedEngine):
         """Raise the bound until there is a map that costs no more. All links are given."""
         self._end_begun()
         while True:
-            self._configure()  # the search beside may have ended
             spares = (self.bound or 0) - len(self.clique)
             answers = self._answers(facts.read_names, f"enum,{spares},{spares}", 0, until=self._settled)
             answer = next(answers, None)
@@ -409,7 +406,7 @@ class NamedEngine(ChartedEngine):
         for start in range(0, len(added), AT_A_TIME):
             self._watch.check()
             self._give(added[start : start + AT_A_TIME])
-        self._watch.check(PREPARING * (self.ground_seconds - before))
+        self._check_ahead(PREPARING * (self.ground_seconds - before))
 
     def _give(self, links: Iterable[Link]) -> None:
         began = time.perf_counter()

@@ -365,7 +365,7 @@ class Beside:
         self.labels: Labels | None = None
         self.bound = 0
         self._watch = watch
-        self._held = [engine, found]
+        self._held = [engine, found]  # until they are freed
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, args=(engine, found), daemon=True)
         self._thread.start()

@@ -88,8 +88,10 @@ class OnlineMapper:
         first = Step.of(view, star, "step 0")
         theory = theory or Theory.topological()
         self.theory = theory.resolve(Trace((first,)))
-        engine = "named" if theory.level == "causal" else "guessing" if has_frames(self.theory) else "engine"
-        importlib.import_module(f"ssh_abduction.{engine}")  # now rather than at the step that first needs it, as it takes its time
+        if theory.level == "causal":  # now rather than at the step that first needs it, as it takes its time
+            importlib.import_module("ssh_abduction.named")
+        elif has_frames(self.theory):
+            importlib.import_module("ssh_abduction.guessing")
         began = time.perf_counter()
         self.searches = 0  # how often clingo was asked
         self._without_stars = theory.star == "auto" and self.theory.star == "none"

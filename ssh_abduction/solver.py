@@ -230,7 +230,7 @@ class Search:
         after: Search | None = None,
         minimal: SSHMap | None = None,
     ) -> None:
-        for name, value in (("limit", limit), ("maps", maps), ("memory", memory)):
+        for name, value in (("limit (--time-limit)", limit), ("maps (--maps)", maps), ("memory (--memory-limit)", memory)):
             if isinstance(value, bool) or not isinstance(value, int | float | None):
                 raise SolverError(f"{name}: expected a number, got {brief(value)}")
         if limit is not None and not limit > 0:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Generator, Iterable
+from collections.abc import Generator
 from unittest.mock import Mock, patch
 
 import pytest
@@ -157,21 +158,21 @@ def test_where_clingo_would_prepare_for_too_long_the_search_beside_goes_on() -> 
     """Which proves here what the other one was stopped at."""
     walk = maze(3, 3, steps=300, seed=0)
     expected = solve(walk.trace, CAUSAL).cost
-    add = named.NamedEngine._add
+    check_ahead = named.NamedEngine._check_ahead
     stopped = []
 
-    def stop(self: named.NamedEngine, links: Iterable[named.Link]) -> None:
+    def stop(self: named.NamedEngine, seconds: float) -> None:
         if self._beside:
             stopped.append(self)
-            raise engine.Stopped("time limit")
-        add(self, links)
+            seconds = math.inf
+        check_ahead(self, seconds)
 
     with (
         patch.multiple(named, PATIENCE=1),
         patch.object(named.NamedEngine, "_has_processors", lambda _: True),
-        patch.object(named.NamedEngine, "_add", stop),
+        patch.object(named.NamedEngine, "_check_ahead", stop),
     ):
-        solution = solve(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"), maps=1)
+        solution = solve(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"), maps=1, limit=100)
     assert stopped
     assert solution.status is Status.OPTIMAL
     assert solution.cost == expected
