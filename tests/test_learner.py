@@ -192,7 +192,8 @@ def test_recognition_by_poor_labels_is_poor(run: Trace) -> None:
     assert rate(images, np.zeros_like(codes), truth, 0) == pytest.approx(1 / 8, abs=0.05)
 
 
-def test_outcomes_differ_over_notch_and_spread() -> None:
+def test_outcomes_differ_over_notch_and_spread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", replace(EXPERIMENTS["notched-rectangle"], tours=16))
     good, blurred, bare = outcome(0.03, 0.5), outcome(0.03, 8), outcome(0.0, 0.5)
     assert (good.k, good.right) == (4, True)
     assert good.rate > 0.99
@@ -262,7 +263,7 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With few circuits, so that it is quick; the claims themselves are measured by `reproduce`, over 20 seeds."""
-    small = replace(EXPERIMENTS["notched-rectangle"], tours=12, k_max=8)
+    small = replace(EXPERIMENTS["notched-rectangle"], tours=10, k_max=8)
     monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", small)
     words = ["reproduce", "notched-rectangle", "--seeds", "500", "--jobs", "1", "--no-outcomes", "-o", str(tmp_path)]
     assert main(words) == 0
@@ -280,6 +281,7 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     assert configuration["versions"]["clingo"]
     claimed = json.loads((tmp_path / "claims.json").read_text())
     assert all(row["seeds"] == 1 for row in claimed)
+    monkeypatch.setattr("ssh_abduction.reproduce.report._draw", lambda *_: None)  # once is enough
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["claims"] == claimed
 
@@ -288,7 +290,7 @@ def test_a_summary_counts_the_seeds_in_which_a_claim_holds() -> None:
     from ssh_abduction.reproduce.claims import measure
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(EXPERIMENTS, "notched-rectangle", replace(EXPERIMENTS["notched-rectangle"], tours=12, k_max=8))
+        patch.setitem(EXPERIMENTS, "notched-rectangle", replace(EXPERIMENTS["notched-rectangle"], tours=10, k_max=8))
         good = measure("notched-rectangle", 500)
     bad = replace(good, seed=1, k=5, uncertainty={**good.uncertainty, 5: 0.9}, cost={"dstates": 9, "places": 4, "paths": 4}, right=False)
     table = {row["claim"]: row for row in summary("notched-rectangle", [good, bad])}
