@@ -230,38 +230,16 @@ class Engine:
         until: Callable[[], bool] = lambda: False,
     ) -> Generator[Answer, None, bool]:
         """What clingo answers, read at once. Returns whether it came to an end, and not to the limit of conflicts, or to where `until` holds."""
-        control = control or self._control
-        configuration: Any = control.configuration.solve
-        configuration.opt_mode = mode
-        configuration.models = models
-        configuration.project = "project" if not mode.startswith("opt") else "no"
-        configuration.solve_limit = f"{conflicts},-1"
-        began = time.perf_counter()
-        with ExitStack() as stack:
-            with _held_back_interrupts():
-                handle = stack.enter_context(control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound))
-            try:
-                while True:
-                    handle.resume()
-                    while not handle.wait(POLL):
-                        self._watch.check()
-                        if until():
-                            return False
-                    self._watch.check()
-                    model = handle.model()
-                    if model is None:
-                        result = handle.get()
-                        if result.interrupted and conflicts < 0:
-                            raise Stopped("interrupted")
-                        return bool(result.exhausted)
-                    answer = read(model)
-                    self.solve_seconds += time.perf_counter() - began
-                    began = math.inf  # if the caller takes no more, nothing is added below
-                    yield answer
-                    began = time.perf_counter()
-            finally:
-                handle.cancel()
-                self.solve_seconds += max(0.0, time.perf_counter() - began)
+        project = "project" if not mode.startswith("opt") else "no"
+        with self._solving(control or self._control, assumptions, mode, models, project, conflicts, on_bound) as handle:
+            while True:
+                handle.resume()
+                if not self._has_come(handle, until):
+                    return False
+                model = handle.model()
+                if model is None:
+                    return bool(_result(handle, conflicts).exhausted)
+                yield read(model)
 
     def _verdict(
         self,
@@ -272,32 +250,62 @@ class Engine:
         until: Callable[[], bool] = lambda: False,
     ) -> tuple[Answer | None, list[int] | None]:
         """An answer that these literals are true in, or else a core of them; neither where the limit of conflicts was reached, or `until` holds."""
-        configuration: Any = self._control.configuration.solve
-        configuration.opt_mode, configuration.models, configuration.project = mode, 1, "no"
+        with self._solving(self._control, assumed, mode, 1, "no", conflicts) as handle:
+            if not self._has_come(handle, until):
+                return None, None
+            model = handle.model()
+            if model is not None:
+                return read(model), None
+            if not _result(handle, conflicts).unsatisfiable:
+                return None, None
+            known = set(assumed)
+            return None, [literal for literal in handle.core() if literal in known]  # external atoms are assumed, too
+
+    @contextmanager
+    def _solving(
+        self,
+        control: clingo.Control,
+        assumptions: Sequence[tuple[clingo.Symbol, bool] | int],
+        mode: str,
+        models: int,
+        project: str,
+        conflicts: int,
+        on_bound: Callable[[Sequence[int]], None] | None = None,
+    ) -> Iterator[clingo.SolveHandle]:
+        """A search of clingo's in its own thread. It ends with this."""
+        configuration: Any = control.configuration.solve
+        configuration.opt_mode, configuration.models, configuration.project = mode, models, project
         configuration.solve_limit = f"{conflicts},-1"
         began = time.perf_counter()
         with ExitStack() as stack:
             with _held_back_interrupts():
-                handle = stack.enter_context(self._control.solve(assumed, yield_=True, async_=True))
+                handle = stack.enter_context(control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound))
+            self.solve_seconds += time.perf_counter() - began
             try:
-                while not handle.wait(POLL):
-                    self._watch.check()
-                    if until():
-                        return None, None
-                self._watch.check()
-                model = handle.model()
-                if model is not None:
-                    return read(model), None
-                result = handle.get()
-                if result.interrupted and conflicts < 0:
-                    raise Stopped("interrupted")
-                if not result.unsatisfiable:
-                    return None, None
-                known = set(assumed)
-                return None, [literal for literal in handle.core() if literal in known]  # external atoms are assumed, too
+                yield handle
             finally:
                 handle.cancel()
-                self.solve_seconds += time.perf_counter() - began
+
+    def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
+        """Wait until clingo has come to an answer or an end; or until `until` holds, and then False."""
+        began = time.perf_counter()
+        try:
+            while not handle.wait(POLL):
+                self._watch.check()
+                if until():
+                    return False
+            self._watch.check()
+            return True
+        finally:
+            self.solve_seconds += time.perf_counter() - began
+
+
+def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
+    """How a search ended. Raises Stopped if something else than the limit of conflicts ended it."""
+    result = handle.get()
+    if result.interrupted and conflicts < 0:
+        raise Stopped("interrupted")
+    return result
 
 
 class StepEngine(Engine):

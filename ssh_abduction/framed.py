@@ -10,12 +10,10 @@ a lower bound, and if some answer of that cost has streets, all minimal maps are
 that are one. If no single street does, or visits are too many for that, streets.lp is asked which labels clash: smallest sets of nodes at
 dstates that no streets fit; same.lp is told that these do not go together. As every map of the full theory keeps that, bounds still hold.
 
-*Beside.* What takes long is guessed in another thread (`annealing.py`). Where the guess cannot be right its places are let free, and what is there
-is merged by evidence (`merging.py`), while streets.lp says which visits cannot be one, and which have to be: so a guess becomes a map. Near
-it, maps are made here, while there it is proven with
-names, from the guess outwards, how many dstates the causal axioms need (`nearby.py`). Where a map has so few, it has the fewest; and the same
-names then list all ways to be at so few. Some of them fit no frame, which streets.lp sees, or have no streets; but each map of the full
-theory is among them.
+*Beside.* What takes long is guessed in another thread, and the guess made a map (`streets.py`). Near it, maps are made here, while there it is
+proven with names, from the guess outwards, how many dstates the causal axioms need (`nearby.py`). Where a map has so few, it has the fewest;
+and the same names then list all ways to be at so few. Some of them fit no frame, which streets.lp sees, or have no streets; but each map of the
+full theory is among them.
 """
 
 from __future__ import annotations
@@ -24,22 +22,19 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain, combinations
 
 import clingo
-import numpy as np
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.annealing import SECONDS, attempts
-from ssh_abduction.apart import Matrix
 from ssh_abduction.chart import Chart, FramedChart, NoFrame, numbered
 from ssh_abduction.engine import Found, Watch
-from ssh_abduction.merging import Told, kept, merged_as_told, merged_near
-from ssh_abduction.nearby import Beside, NearbyEngine, mended
+from ssh_abduction.merging import kept
+from ssh_abduction.nearby import Beside, NearbyEngine
 from ssh_abduction.replay import Log
 from ssh_abduction.same import SECONDS_A_PAIR, Pair, SameEngine, TakesLong, smaller
 from ssh_abduction.speedups import Speedups
+from ssh_abduction.streets import Streets
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
@@ -54,7 +49,6 @@ KEPT = 10  # controls of minimal namings that are kept until their maps are list
 SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside
 GUESS_FIRST = 5.0  # the same, where that has to be done first
 GUESSABLE = 1_000_000  # visits that may be one, above which annealing takes too much memory
-LOOSENED = 2  # so many travels, less one, from where a guess cannot be right its places are let free
 GUESSES = 20  # labels that are tried, near what annealing guesses
 GUESSING = 1000  # conflicts after which better streets of these are no longer sought
 BETTERING = 20_000  # conflicts after which better streets are no longer sought one after another
@@ -85,6 +79,10 @@ class FramedEngine(SameEngine):
         self._street_seconds = 0.0  # what the last control for streets took, which cannot be stopped meanwhile
         self._framed = True  # whether the visits fit their frames
         self._best: tuple[tuple[int, ...], list[_Naming]] | None = None  # the minimal cost, and all namings that have it
+
+    @property
+    def _streets(self) -> Streets:
+        return Streets(self._trace, self._theory)
 
     def grow(self, size: int) -> None:
         if size != self.size:
@@ -132,7 +130,7 @@ class FramedEngine(SameEngine):
             except TakesLong:
                 if not self._guessed:
                     self._guessed = True
-                    yield from self._guesses(self._guess or self._guessed_labels(self._chart, self._watch.check))
+                    yield from self._guesses(self._guess or self._streets.guessed_labels(self._chart, self._watch.check))
                 else:
                     yield from self._news_beside()
                     yield from self._bettered()
@@ -170,30 +168,8 @@ class FramedEngine(SameEngine):
 
     def _fewer_labels(self, named: NearbyEngine, chart: FramedChart, check: Callable[[], None]) -> Iterator[list[int]]:
         """Labels, each time fewer, of maps of the causal axioms near a guess."""
-        self._guess = self._guessed_labels(chart, check)
+        self._guess = self._streets.guessed_labels(chart, check)
         yield from named.fewer(self._guess)
-
-    def _guessed_labels(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
-        """Labels of a map of the causal axioms: one that has streets, as far as single streets tell, or where that is not soon found one of few dstates."""
-        began = time.thread_time()  # a thread may be made to wait
-        apart = chart.apart()
-        found: list[list[int]] = []
-        for _, guess in attempts(replace(chart, elsewhere=()), check):
-            starts = [
-                mended(guess.labels(chart), chart),
-                guess.labels(chart),
-                *(guess.loosened(chart, travels).labels(chart) for travels in range(LOOSENED)),
-            ]
-            maps = [(merged_near(apart, chart.links, start, check), start) for start in starts]
-            ranked = sorted(maps, key=lambda pair: len(set(pair[0])))
-            for _, start in ranked:
-                labels = merged_as_told(apart, chart.links, start, partial(self._told, chart), check)
-                if labels and self._has_single_streets(chart, labels):
-                    return labels
-            found.append(ranked[0][0])
-            if time.thread_time() - began > SECONDS:
-                return min(found, key=lambda labels: len(set(labels)))
-        raise AssertionError
 
     def map_of_guess(self) -> Found | None:
         """A map of the whole trace made of a guess, without a search: None where none is found soon."""
@@ -203,7 +179,7 @@ class FramedEngine(SameEngine):
             return None
         if len(self._chart.fits()) > GUESSABLE:
             return None
-        return self._single_streets(self._guessed_labels(self._chart, self._watch.check))
+        return self._single_streets(self._streets.guessed_labels(self._chart, self._watch.check))
 
     def map_mended_from(self, known: Sequence[int]) -> Found | None:
         """A map of the whole trace in which the first steps keep these dstates, as far as can be, and all else is new, if that has streets."""
@@ -212,24 +188,6 @@ class FramedEngine(SameEngine):
         for node, label in zip(chart.node_of, known, strict=False):
             guess[node] = label
         return self._single_streets(kept(chart.apart(), chart.links, guess))
-
-    def _has_single_streets(self, chart: FramedChart, labels: Sequence[int]) -> bool:
-        """Whether these labels have streets, as far as single ones tell. Takes so little time that no limit has to stop it."""
-        return bool(self._settled_streets(chart, labels, single=True).solve().satisfiable)
-
-    def _told(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
-        """Which nodes are apart, and which are one, where these labels hold of all nodes but some; None where that cannot be."""
-        control = self._streets_of(chart)
-        control.add("base", [], f"{facts.settled_labels(enumerate(labels))}\n{facts.loose({labels[node] for node in loose})}")
-        control.ground([("base", []), ("again", []), ("apart", [])])
-        with control.solve(yield_=True) as handle:
-            model = handle.model()
-            assert model
-            violated, elsewhere, one = facts.read_told(model)
-        if violated:
-            return None
-        first = {label: node for node, label in reversed(list(enumerate(labels)))}
-        return _apart(chart, labels, elsewhere), [(first[a], first[b]) for a, b in one]
 
     def _end_beside(self) -> None:
         if self._beside:
@@ -273,7 +231,7 @@ class FramedEngine(SameEngine):
         """The known map with better streets, unless these were looked for already, or there is no time for that."""
         if self._known and self._known_cost and len(self._theory.priorities) > 1 and self._watch.allows(self._preparing):
             cost, self._known_cost = self._known_cost, ()
-            yield from (found for found in self._streets(_Naming(list(self._known), None), "opt", GUESSING) if found.cost < cost)
+            yield from (found for found in self._maps(_Naming(list(self._known), None), "opt", GUESSING) if found.cost < cost)
 
     def _news_beside(self) -> Iterator[Found]:
         """A map of the labels last found beside, if they are new and have streets."""
@@ -302,7 +260,7 @@ class FramedEngine(SameEngine):
             return
         count = 0
         for naming in self._best[1] if self._best and self._best[0] == cost else self._fitting(cost[0]):
-            for found in self._streets(naming, f"enum,{','.join(map(str, (0, *cost[1:])))}"):
+            for found in self._maps(naming, f"enum,{','.join(map(str, (0, *cost[1:])))}"):
                 yield found
                 count += 1
                 if count == enough:
@@ -339,12 +297,12 @@ class FramedEngine(SameEngine):
             if found is not None:
                 return found, naming
         naming = replace(naming, control=self._street_control(labels))
-        return next(self._streets(naming, "ignore"), None), naming
+        return next(self._maps(naming, "ignore"), None), naming
 
     def _single_streets(self, labels: Sequence[int]) -> Found | None:
         """A map with these dstates in which no two places or stretches are taken for one, unless they have to be; if there is one."""
         naming = _Naming(list(labels), self._street_control(labels, single=True))
-        return next(self._streets(naming, "ignore"), None)
+        return next(self._maps(naming, "ignore"), None)
 
     def _better_streets(self, naming: _Naming) -> Iterator[Found]:
         """Maps with these dstates, each as good as the one before or better, the last one best; none if no streets fit them.
@@ -352,14 +310,14 @@ class FramedEngine(SameEngine):
         Where bettering maps does not end soon, the bound is raised from below instead.
         """
         if len(self._theory.priorities) == 1:
-            yield from self._streets(naming, "ignore")
+            yield from self._maps(naming, "ignore")
             return
-        proven = yield from self._streets(naming, "opt", BETTERING)
+        proven = yield from self._maps(naming, "opt", BETTERING)
         if not proven:
             control = self._street_control(naming.labels, ["--opt-strategy=usc"])
-            yield from self._streets(replace(naming, control=control), "opt")
+            yield from self._maps(replace(naming, control=control), "opt")
 
-    def _streets(self, naming: _Naming, mode: str, conflicts: int = -1) -> Generator[Found, None, bool]:
+    def _maps(self, naming: _Naming, mode: str, conflicts: int = -1) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
         labels = naming.labels
         control = naming.control or self._street_control(labels)
@@ -382,21 +340,11 @@ class FramedEngine(SameEngine):
         """A control for the streets that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
         self._watch.check(0.0 if single else self._preparing)
         began, worked = time.perf_counter(), time.thread_time()
-        control = self._settled_streets(self._chart, labels, options, nodes, single=single)
+        control = self._streets.settled(self._chart, labels, options, nodes, single=single)
         self._watch.check()
         seconds = time.thread_time() - worked  # of this thread: the one beside may have made it wait
         self._street_seconds = (self._street_seconds or ALL_STREETS * seconds) if single else seconds
         self.ground_seconds += time.perf_counter() - began
-        return control
-
-    def _settled_streets(
-        self, chart: FramedChart, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None, *, single: bool
-    ) -> clingo.Control:
-        control = self._streets_of(chart, options)
-        control.load(encodings.path("preference"))
-        nodes = range(len(labels)) if nodes is None else nodes
-        control.add("base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single))
-        control.ground([("base", []), *([("again", [])] if single else []), ("least", [])])
         return control
 
     def _forbid(self, labels: Sequence[int]) -> None:
@@ -413,7 +361,7 @@ class FramedEngine(SameEngine):
 
     def _say_street(self, labels: Sequence[int]) -> bool:
         """Say what order and sides demand of a street that these labels contradict. False if all such streets have been told of."""
-        control = self._streets_of(self._chart)
+        control = self._streets.control(self._chart)
         control.add("base", [], facts.settled_labels(enumerate(labels)))
         control.ground([("base", []), ("again", []), ("contrary", [])])
         contrary, twice = next(self._answers(facts.read_contrary, "ignore", 1, control=control))
@@ -459,7 +407,7 @@ class FramedEngine(SameEngine):
 
     def _clashing(self, labels: Sequence[int]) -> list[list[int]]:
         """Sets of nodes whose labels no streets fit, of none of which a node can be spared: CLASHES of them at most."""
-        control = self._streets_of(self._chart, SMALLEST)
+        control = self._streets.control(self._chart, SMALLEST)
         control.add("base", [], facts.open_labels(labels))
         control.ground([("base", [])])
         clashes = list(self._answers(lambda model: sorted(facts.read_names(model)), "ignore", CLASHES, control=control))
@@ -477,30 +425,8 @@ class FramedEngine(SameEngine):
     def _charted(self, size: int) -> FramedChart:
         """The nodes, and which of them are at different places because of what the trace alone says of order and sides."""
         chart = Chart.framed(self._trace, self._log, size)
-        control = self._streets_of(chart)
         nodes = range(len(chart.seen))
-        control.add("base", [], f"{facts.settled_labels(zip(nodes, nodes, strict=True))}\n{facts.loose(nodes)}")
-        control.ground([("base", []), ("apart", [])])
+        control = self._streets.telling(chart, nodes, nodes)
         self._watch.check()
         _, elsewhere, _ = next(self._answers(facts.read_told, "ignore", 1, control=control))
         return replace(chart, elsewhere=elsewhere)
-
-    def _streets_of(self, chart: FramedChart, options: Sequence[str] = ()) -> clingo.Control:
-        """A control with the axioms of places and paths, and what happened."""
-        control = clingo.Control(["--warn=none", *options])
-        control.load(encodings.path("streets"))
-        control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
-        return control
-
-
-def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:
-    """Nodes x nodes: they are of visits some nodes of which have labels that are at different places."""
-    pairs = np.array(list(elsewhere), dtype=int).reshape(-1, 2)
-    different = np.zeros((max(labels) + 1,) * 2, dtype=bool)
-    different[pairs[:, 0], pairs[:, 1]] = different[pairs[:, 1], pairs[:, 0]] = True
-    visits = np.array([visit for visit, _ in chart.facing])  # in order, as nodes are numbered by the first step at them
-    starts = np.flatnonzero(np.diff(visits, prepend=-1))
-    rows = np.logical_or.reduceat(different[list(labels)], starts, axis=0)
-    apart = np.logical_or.reduceat(rows[:, list(labels)], starts, axis=1)
-    nodes: Matrix = apart[np.ix_(visits, visits)]
-    return nodes

@@ -30,6 +30,7 @@ from ssh_abduction import (
     same,
     solve,
     solver,
+    streets,
 )
 from ssh_abduction.annealing import Guess, attempts
 from ssh_abduction.chart import QUARTERS, Chart, FramedChart, NoFrame, numbered
@@ -114,7 +115,7 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         "TRY_CONFLICTS": data.draw(st.sampled_from([0, same.TRY_CONFLICTS]), label="tries"),
         "FAILED_TRIES": data.draw(st.sampled_from([1, same.FAILED_TRIES]), label="failed tries"),
     }
-    streets = {
+    sought = {
         "BETTERING": data.draw(st.sampled_from([0, framed.BETTERING]), label="bettering"),
         "CLASHES": data.draw(st.sampled_from([1, framed.CLASHES]), label="clashes"),
         "MANY_PAIRS": data.draw(st.sampled_from([5, framed.MANY_PAIRS]), label="many pairs"),
@@ -131,7 +132,8 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         patch.object(solver, "FEW_STEPS", 0),
         prefixes,
         patch.multiple(same, **cores),
-        patch.multiple(framed, **streets, SECONDS=0.0),
+        patch.multiple(framed, **sought),
+        patch.object(streets, "SECONDS", 0.0),
         patch.multiple(annealing, ANNEALED=((0.5, data.draw(st.integers(1, 20), label="sweeps")),), LAST=2),
         patch.object(FramedEngine, "_charted", charted),
         patch.object(FramedEngine, "_has_processors", lambda _: processors),
@@ -158,7 +160,8 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: The
     expected = solve(trace, theory, maps=0, speedups=PLAIN)
     with (
         patch.object(solver, "FEW_STEPS", 0),
-        patch.multiple(framed, SOON=-1.0, Beside=Before, SECONDS=0.0, MANY_DSTATES=sweeps % 2),
+        patch.multiple(framed, SOON=-1.0, Beside=Before, MANY_DSTATES=sweeps % 2),
+        patch.object(streets, "SECONDS", 0.0),
         patch.multiple(annealing, ANNEALED=((0.5, sweeps),), LAST=2),
         patch.object(FramedEngine, "_has_processors", lambda _: True),
         patch.object(FramedEngine, "_named_at", always_named_at),
@@ -364,7 +367,7 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
         labels = engine._minimal_labels()
         assert labels
         chart = engine._chart
-        control = engine._streets_of(chart)
+        control = engine._streets.control(chart)
         control.add("base", [], facts.settled_labels(enumerate(labels)))
         control.ground([("base", []), ("contrary", [])])
         contrary, _ = next(engine._answers(facts.read_contrary, "ignore", 1, control=control))
@@ -584,7 +587,7 @@ def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: T
         labels = node_labels(ssh_map, chart)
         loosened = numbered(data.draw(loosened_labels(labels)))
         loose = [node for node in range(len(labels)) if loosened.count(loosened[node]) == 1]
-        told = asked._told(chart, loosened, loose)
+        told = asked._streets.told(chart, loosened, loose)
         assert told is not None
         apart, one = told
         place = {s.id: s.place for s in ssh_map.dstates}
@@ -603,12 +606,14 @@ def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[
     chart = asked._chart
     apart = chart.apart()
     start = guess[: len(chart.seen)]
-    labels = merged_as_told(apart, chart.links, start, partial(asked._told, chart)) if told else merged_near(apart, chart.links, start)
+    labels = (
+        merged_as_told(apart, chart.links, start, partial(asked._streets.told, chart)) if told else merged_near(apart, chart.links, start)
+    )
     if labels is None:
         return
     assert chart.is_map(labels)
     assert not any(apart[i, j] for i in range(len(labels)) for j in range(i) if labels[i] == labels[j])
-    singles = asked._has_single_streets(chart, labels)
+    singles = asked._streets.has_single(chart, labels)
     if singles or not told:
         with patch.object(framed, "MANY_DSTATES", 100):
             assert (asked._some_streets(labels)[0] is not None) >= singles
@@ -624,7 +629,7 @@ def test_a_true_guess_stays_as_it_is(seed: int) -> None:
     apart = chart.apart()
     assert merged_near(apart, chart.links, truth) == truth
     some = [-1 if 20 <= node < 60 else label for node, label in enumerate(truth)]
-    assert merged_as_told(apart, chart.links, some, partial(asked._told, chart)) == truth
+    assert merged_as_told(apart, chart.links, some, partial(asked._streets.told, chart)) == truth
 
 
 @pytest.mark.parametrize("loops", [0.1, 0.3])
@@ -640,10 +645,10 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float) ->
             failed.append(wrong)
             yield wrong, guess
 
-    with patch.object(annealing, "ANNEALED", ((0.5, 100),)), patch.object(framed, "attempts", counted):
-        labels = asked._guessed_labels(chart, lambda: None)
+    with patch.object(annealing, "ANNEALED", ((0.5, 100),)), patch.object(streets, "attempts", counted):
+        labels = asked._streets.guessed_labels(chart, lambda: None)
     assert failed[0] > 0
-    assert asked._has_single_streets(chart, labels)
+    assert asked._streets.has_single(chart, labels)
     assert len(set(labels)) < 1.1 * len(set(walk.truth))
 
 

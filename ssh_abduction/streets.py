@@ -1,0 +1,113 @@
+"""Questions to streets.lp: what order and sides say of the dstates of a trace whose places have frames, and which guesses they let be maps.
+
+What takes a choice of places and paths is asked by an engine, under its limits (`framed.py`). What is asked here takes none, and so little
+time that no limit has to stop it.
+
+*A guess.* Visits are annealed (`annealing.py`). Where the guess cannot be right its places are let free, and what is there is merged by evidence
+(`merging.py`), while streets.lp says which visits cannot be one, and which have to be: so a guess becomes a map.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import clingo
+import numpy as np
+
+from ssh_abduction import encodings, facts
+from ssh_abduction.annealing import SECONDS, attempts
+from ssh_abduction.apart import Matrix
+from ssh_abduction.chart import FramedChart
+from ssh_abduction.merging import Told, merged_as_told, merged_near
+from ssh_abduction.nearby import mended
+from ssh_abduction.theory import Theory
+from ssh_abduction.trace import Trace
+
+LOOSENED = 2  # so many travels, less one, from where a guess cannot be right its places are let free
+
+
+class Streets:
+    """The axioms of places and paths, for charts of one trace."""
+
+    def __init__(self, trace: Trace, theory: Theory) -> None:
+        self._trace = trace
+        self._theory = theory
+
+    def control(self, chart: FramedChart, options: Sequence[str] = ()) -> clingo.Control:
+        """A control with these axioms, and what happened; nothing is grounded yet."""
+        control = clingo.Control(["--warn=none", *options])
+        control.load(encodings.path("streets"))
+        control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
+        return control
+
+    def settled(
+        self, chart: FramedChart, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None, *, single: bool
+    ) -> clingo.Control:
+        """A control for the streets that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
+        control = self.control(chart, options)
+        control.load(encodings.path("preference"))
+        nodes = range(len(labels)) if nodes is None else nodes
+        control.add("base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single))
+        control.ground([("base", []), *([("again", [])] if single else []), ("least", [])])
+        return control
+
+    def telling(self, chart: FramedChart, labels: Sequence[int], loose: Iterable[int]) -> clingo.Control:
+        """A control for what holds wherever the nodes are at these dstates, though loose ones may turn out to be others."""
+        control = self.control(chart)
+        control.add("base", [], f"{facts.settled_labels(enumerate(labels))}\n{facts.loose(loose)}")
+        control.ground([("base", []), ("again", []), ("apart", [])])
+        return control
+
+    def told(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
+        """Which nodes are apart, and which are one, where these labels hold of all nodes but some; None where that cannot be."""
+        control = self.telling(chart, labels, {labels[node] for node in loose})
+        with control.solve(yield_=True) as handle:
+            model = handle.model()
+            assert model
+            violated, elsewhere, one = facts.read_told(model)
+        if violated:
+            return None
+        first = {label: node for node, label in reversed(list(enumerate(labels)))}
+        return _apart(chart, labels, elsewhere), [(first[a], first[b]) for a, b in one]
+
+    def has_single(self, chart: FramedChart, labels: Sequence[int]) -> bool:
+        """Whether these labels have streets, as far as single ones tell."""
+        return bool(self.settled(chart, labels, single=True).solve().satisfiable)
+
+    def guessed_labels(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
+        """Labels of a map of the causal axioms: one that has streets, as far as single ones tell, or where that is not soon found one of few dstates."""
+        began = time.thread_time()  # a thread may be made to wait
+        apart = chart.apart()
+        found: list[list[int]] = []
+        for _, guess in attempts(replace(chart, elsewhere=()), check):
+            starts = [
+                mended(guess.labels(chart), chart),
+                guess.labels(chart),
+                *(guess.loosened(chart, travels).labels(chart) for travels in range(LOOSENED)),
+            ]
+            maps = [(merged_near(apart, chart.links, start, check), start) for start in starts]
+            ranked = sorted(maps, key=lambda pair: len(set(pair[0])))
+            for _, start in ranked:
+                labels = merged_as_told(apart, chart.links, start, partial(self.told, chart), check)
+                if labels and self.has_single(chart, labels):
+                    return labels
+            found.append(ranked[0][0])
+            if time.thread_time() - began > SECONDS:
+                return min(found, key=lambda labels: len(set(labels)))
+        raise AssertionError
+
+
+def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:
+    """Nodes x nodes: they are of visits some nodes of which have labels that are at different places."""
+    pairs = np.array(list(elsewhere), dtype=int).reshape(-1, 2)
+    different = np.zeros((max(labels) + 1,) * 2, dtype=bool)
+    different[pairs[:, 0], pairs[:, 1]] = different[pairs[:, 1], pairs[:, 0]] = True
+    visits = np.array([visit for visit, _ in chart.facing])  # in order, as nodes are numbered by the first step at them
+    starts = np.flatnonzero(np.diff(visits, prepend=-1))
+    rows = np.logical_or.reduceat(different[list(labels)], starts, axis=0)
+    apart = np.logical_or.reduceat(rows[:, list(labels)], starts, axis=1)
+    nodes: Matrix = apart[np.ix_(visits, visits)]
+    return nodes
