@@ -27,8 +27,8 @@ from suite import INSTANCES
 from table import OURS, WITHOUT
 
 from ssh_abduction import Search, Solution, Speedups, Theory, Trace
+from ssh_abduction.asking import peak_memory
 from ssh_abduction.checker import check
-from ssh_abduction.engine import peak_memory
 from ssh_abduction.solver import Status
 
 AROUND = 300  # seconds for all that the clock does not count

@@ -27,10 +27,11 @@ from itertools import chain, combinations
 import clingo
 
 from ssh_abduction import encodings, facts
+from ssh_abduction.asking import Watch
 from ssh_abduction.chart import Chart, FramedChart, NoFrame, numbered
-from ssh_abduction.engine import Found, Watch
+from ssh_abduction.engine import Found
 from ssh_abduction.merging import kept
-from ssh_abduction.nearby import Beside, NearbyEngine
+from ssh_abduction.nearby import Beside, NearbySearch
 from ssh_abduction.replay import Log
 from ssh_abduction.same import SECONDS_A_PAIR, Pair, SameEngine, TakesLong, smaller
 from ssh_abduction.speedups import Speedups
@@ -75,7 +76,7 @@ class FramedEngine(SameEngine):
         self._known_cost: tuple[int, ...] = ()  # of the known map, until better streets were looked for
         self._beside: Beside | None = None  # a search that begins with the guess
         self._tried: list[int] | None = None  # labels found there, the last of which it is known whether they have streets
-        self._named: NearbyEngine | None = None  # what searches there
+        self._named: NearbySearch | None = None  # what searches there
         self._street_seconds = 0.0  # what the last control for streets took, which cannot be stopped meanwhile
         self._framed = True  # whether the visits fit their frames
         self._best: tuple[tuple[int, ...], list[_Naming]] | None = None  # the minimal cost, and all namings that have it
@@ -152,11 +153,8 @@ class FramedEngine(SameEngine):
         """Begin to guess in another thread, and to prove from there that the causal axioms need so many dstates."""
         watch, pinned = Watch(beside=self._watch), self.clique or [0]
         apart = chart.apart(others=pinned)
-        self._named = NearbyEngine(
-            self._trace,
-            self._theory,
+        self._named = NearbySearch(
             watch,
-            self._log,
             self._speedups,
             chart=chart,
             clique=pinned,
@@ -166,7 +164,7 @@ class FramedEngine(SameEngine):
 
         self._beside = Beside(self._named, watch, self._fewer_labels(self._named, chart, watch.check))
 
-    def _fewer_labels(self, named: NearbyEngine, chart: FramedChart, check: Callable[[], None]) -> Iterator[list[int]]:
+    def _fewer_labels(self, named: NearbySearch, chart: FramedChart, check: Callable[[], None]) -> Iterator[list[int]]:
         """Labels, each time fewer, of maps of the causal axioms near a guess."""
         self._guess = self._streets.guessed_labels(chart, check)
         yield from named.fewer(self._guess)
@@ -207,7 +205,7 @@ class FramedEngine(SameEngine):
         named = self._named_at(dstates)
         yield from named.listed(self._watch) if named else super()._labels_of(dstates)
 
-    def _named_at(self, dstates: int) -> NearbyEngine | None:
+    def _named_at(self, dstates: int) -> NearbySearch | None:
         """What searched beside, if that alone showed that there are no fewer dstates."""
         return self._named if self._named and self._named.bound == dstates > self._least else None
 

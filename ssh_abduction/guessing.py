@@ -10,7 +10,7 @@ import weakref
 from collections.abc import Sequence
 from concurrent.futures import Future
 
-from ssh_abduction.engine import Stopped, Watch, has_processors
+from ssh_abduction.asking import Stopped, Watch, has_processors
 from ssh_abduction.framed import FramedEngine
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.replay import Log

@@ -41,10 +41,11 @@ from numpy.typing import NDArray
 from ssh_abduction import facts
 from ssh_abduction.annealing import annealed, annealed_steps
 from ssh_abduction.apart import apart_from, clique, far_apart
+from ssh_abduction.asking import POLL, Stopped, Watch, new_control
 from ssh_abduction.chart import Chart, Link, NoFrame, numbered
-from ssh_abduction.engine import AT_ONCE, POLL, ChartedEngine, Found, Stopped, Watch
+from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found
 from ssh_abduction.merging import merged, merged_near, thinned
-from ssh_abduction.nearby import AT_A_TIME, Beside, NearbyEngine, mended
+from ssh_abduction.nearby import AT_A_TIME, Beside, NearbySearch, mended
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
@@ -178,11 +179,8 @@ class NamedEngine(ChartedEngine):
             return
         beside = self._has_processors()
         watch = Watch(beside=self._watch) if beside else self._watch
-        engine = NearbyEngine(
-            self._trace,
-            self._theory,
+        search = NearbySearch(
             watch,
-            self._log,
             self._speedups,
             chart=self._chart,
             clique=self.clique,
@@ -190,18 +188,18 @@ class NamedEngine(ChartedEngine):
             far=self._far,
             configuration="tweety",
         )
-        found = self._fewer_labels(engine, watch.check, None if beside else TRIES)
+        found = self._fewer_labels(search, watch.check, None if beside else TRIES)
         if beside:
-            self._beside = Beside(engine, watch, found)
+            self._beside = Beside(search, watch, found)
             return
         for labels in found:
             self._heed(labels, 0)
             yield labels
-        if engine.bound:
-            self._heed(self._known, engine.bound)
+        if search.bound:
+            self._heed(self._known, search.bound)
             raise _Settled
 
-    def _fewer_labels(self, engine: NearbyEngine, check: Callable[[], None], tries: int | None) -> Iterator[list[int]]:
+    def _fewer_labels(self, search: NearbySearch, check: Callable[[], None], tries: int | None) -> Iterator[list[int]]:
         """Labels, each time fewer: of a map merged by evidence, of one that is guessed, and of those near that."""
         apart, links = self._chart.apart(AT_ONCE), self._chart.links
         fewest = len(self._chart.seen) + 1
@@ -214,7 +212,7 @@ class NamedEngine(ChartedEngine):
             return
         known = thinned(apart, links, merged_near(apart, links, guess, check), check)
         del apart  # as large as steps x steps
-        for labels in engine.fewer(known, tries):
+        for labels in search.fewer(known, tries):
             if len(set(labels)) < fewest:
                 yield labels
 
@@ -388,8 +386,8 @@ class NamedEngine(ChartedEngine):
             for t, options in enumerate(self._may_be)
         ]
         cores = ["--opt-strategy=usc"] if self._speedups.core_guided else []
-        self._control = self._new_control(
-            "names", facts.name_facts(names, spares.values(), self._chart.links, self._choices), ["--eq=1", *cores]
+        self._control = new_control(
+            "names", facts.name_facts(names, spares.values(), self._chart.links, self._choices), ["--eq=1", *cores], self._speedups
         )
         self._configure()
         self._given: set[int] = set()  # nodes

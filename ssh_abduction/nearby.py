@@ -34,12 +34,9 @@ import numpy as np
 
 from ssh_abduction import facts
 from ssh_abduction.apart import Matrix
+from ssh_abduction.asking import Asker, Stopped, Watch, new_control
 from ssh_abduction.chart import Chart, numbered
-from ssh_abduction.engine import ChartedEngine, Stopped, Watch
-from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
-from ssh_abduction.theory import Theory
-from ssh_abduction.trace import Trace
 
 CONFLICTS = 2000  # after which a question is left open, at first; then twice as many
 WIDE = 10  # as many times as many, where nothing is assumed of steps
@@ -54,7 +51,7 @@ _Key: TypeAlias = tuple[int, int]  # what is seen at a node, and its label
 _Verdict: TypeAlias = Literal["moved", "needed", "open"]
 
 
-class NearbyEngine(ChartedEngine):
+class NearbySearch(Asker):
     """Maps of the first steps near a guess.
 
     bound  the number of dstates of the last map, once that is proven to be the least
@@ -62,10 +59,7 @@ class NearbyEngine(ChartedEngine):
 
     def __init__(
         self,
-        trace: Trace,
-        theory: Theory,
         watch: Watch,
-        log: Log,
         speedups: Speedups,
         *,
         chart: Chart,
@@ -74,7 +68,8 @@ class NearbyEngine(ChartedEngine):
         far: Matrix | None,
         configuration: str | None = None,
     ) -> None:
-        super().__init__(trace, theory, watch, log, speedups)
+        super().__init__(watch)
+        self._speedups = speedups
         self._chart = chart
         self.clique = list(clique)
         self._may_be = may_be
@@ -153,7 +148,7 @@ class NearbyEngine(ChartedEngine):
         self._choices = [options if t in pinned else [*options, *self._spare[seen[t]]] for t, options in enumerate(map(list, self._may_be))]
         links = self._chart.links
         base = facts.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
-        self._control = self._new_control("names", base, ["--eq=1"])
+        self._control = new_control("names", base, ["--eq=1"], self._speedups)
         if self._configuration:
             configuration: Any = self._control.configuration
             configuration.configuration, configuration.sat_prepro = self._configuration, "no"
@@ -358,16 +353,16 @@ class Beside:
     """A search for small maps in a thread of its own: numpy and clingo let go of Python's lock while they work.
 
     labels  of the last map found, if any
-    bound   of the engine, once the search is over
+    bound   of the search, once the search is over
     """
 
-    def __init__(self, engine: NearbyEngine, watch: Watch, found: Iterator[Labels]) -> None:
+    def __init__(self, search: NearbySearch, watch: Watch, found: Iterator[Labels]) -> None:
         self.labels: Labels | None = None
         self.bound = 0
         self._watch = watch
-        self._held = [engine, found]  # until they are freed
+        self._held = [search, found]  # until they are freed
         self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, args=(engine, found), daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(search, found), daemon=True)
         self._thread.start()
 
     @property
@@ -384,11 +379,11 @@ class Beside:
         self._thread.join()
         threading.Thread(target=self._held.clear).start()  # to free clingo's control may take seconds, for which nobody has to wait
 
-    def _run(self, engine: NearbyEngine, found: Iterator[Labels]) -> None:
+    def _run(self, search: NearbySearch, found: Iterator[Labels]) -> None:
         try:
             for labels in found:
                 self.labels = labels
-            self.bound = engine.bound or 0
+            self.bound = search.bound or 0
         except Stopped:
             pass
         except BaseException as error:

@@ -32,8 +32,9 @@ import numpy as np
 
 from ssh_abduction import facts
 from ssh_abduction.apart import clique
+from ssh_abduction.asking import Watch, new_control
 from ssh_abduction.chart import Chart, FramedChart, numbered
-from ssh_abduction.engine import ChartedEngine, Watch
+from ssh_abduction.engine import ChartedEngine
 from ssh_abduction.replay import Log
 from ssh_abduction.trace import Trace
 
@@ -98,7 +99,7 @@ class SameEngine(ChartedEngine):
     def _begin(self, chart: FramedChart, fits: frozenset[Pair]) -> None:
         """Take a control that knows nothing, for a chart of which these visits may be one."""
         self._first_nodes = len(chart.seen)
-        self._control = self._new_control("same", "", ["--heuristic=Domain"])
+        self._control = new_control("same", "", ["--heuristic=Domain"], self._speedups)
         self._batch = -1
         self._chart = FramedChart((), (), (), (), (), ())  # what clingo knows
         self._fits: frozenset[Pair] = frozenset()

@@ -47,8 +47,9 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from ssh_abduction import facts
+from ssh_abduction.asking import Grounding, Stop, Stopped, Watch
 from ssh_abduction.certificate import RESTS_ON, Certificate, Evidence
-from ssh_abduction.engine import AT_ONCE, Engine, Found, Grounding, StepEngine, Stop, Stopped, Watch
+from ssh_abduction.engine import AT_ONCE, Engine, Found, StepEngine
 from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.replay import Log, Outcome

@@ -33,13 +33,13 @@ from ssh_abduction import (
     streets,
 )
 from ssh_abduction.annealing import Guess, attempts
+from ssh_abduction.asking import Stopped, Watch
 from ssh_abduction.chart import QUARTERS, Chart, FramedChart, NoFrame, numbered
 from ssh_abduction.checker import check
-from ssh_abduction.engine import Stopped, Watch
 from ssh_abduction.framed import FramedEngine
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.merging import merged_as_told, merged_near
-from ssh_abduction.nearby import Beside, NearbyEngine
+from ssh_abduction.nearby import Beside, NearbySearch
 from ssh_abduction.proof import check_bound
 from ssh_abduction.replay import Log
 from ssh_abduction.solver import Cost
@@ -87,12 +87,12 @@ def framed_theories(draw: st.DrawFn) -> Theory:
 class Before(Beside):
     """A search that comes to its end before the other one goes on."""
 
-    def __init__(self, engine: NearbyEngine, watch: Watch, found: Iterator[list[int]]) -> None:
-        super().__init__(engine, watch, found)
+    def __init__(self, search: NearbySearch, watch: Watch, found: Iterator[list[int]]) -> None:
+        super().__init__(search, watch, found)
         self._thread.join()
 
 
-def always_named_at(engine: FramedEngine, dstates: int) -> NearbyEngine | None:
+def always_named_at(engine: FramedEngine, dstates: int) -> NearbySearch | None:
     """The search beside, also where the other one has come to its end, as it soon does on a short trace."""
     return engine._named if engine._named and engine._named.bound == dstates else None
 

@@ -16,16 +16,16 @@ from test_speedups import PLAIN, machines
 from ssh_abduction import Speedups, Status, Theory, Trace, annealing, engine, facts, named, nearby, solve, solver
 from ssh_abduction.annealing import annealed
 from ssh_abduction.apart import apartness, clique, far_apart
+from ssh_abduction.asking import Watch
 from ssh_abduction.chart import Chart, NoFrame
 from ssh_abduction.checker import check
-from ssh_abduction.engine import Watch
-from ssh_abduction.nearby import Beside, NearbyEngine
+from ssh_abduction.nearby import Beside, NearbySearch
 from ssh_abduction.replay import Log
 
 CAUSAL = Theory.causal()
 
 
-def nearby_engine(trace: Trace) -> NearbyEngine:
+def nearby_search(trace: Trace) -> NearbySearch:
     """One that pins a clique, as named.py does."""
     log = Log(trace, CAUSAL)
     apart = apartness(log.seen, log.actions)
@@ -34,11 +34,8 @@ def nearby_engine(trace: Trace) -> NearbyEngine:
     far = far_apart(apart.copy(), log.seen, log.actions)
     watch = Watch()
     watch.start()
-    return NearbyEngine(
-        trace,
-        CAUSAL,
+    return NearbySearch(
         watch,
-        log,
         Speedups(),
         chart=Chart.of_steps(log, len(trace)),
         clique=pinned,
@@ -55,7 +52,7 @@ def test_from_any_guess_to_a_minimal_map(trace: Trace, data: st.DataObject) -> N
     if len(trace) == 1:
         return
     guess = data.draw(st.lists(st.integers(-1, 4), min_size=len(trace), max_size=len(trace)), label="guess")
-    searched = nearby_engine(trace)
+    searched = nearby_search(trace)
     with patch.object(nearby, "CONFLICTS", data.draw(st.sampled_from([1, nearby.CONFLICTS]), label="conflicts")):
         found = list(searched.fewer(guess))
     fewest = solve(trace, CAUSAL, speedups=PLAIN).cost
@@ -115,7 +112,7 @@ def test_a_causal_maze_is_guessed_by_its_turns(seed: int) -> None:
     guess = [labels[node] for node in chart.node_of]
     same = sum(guess[t] >= 0 for t in range(len(guess)))
     assert same > 0.9 * len(guess)
-    searched = nearby_engine(walk.trace)
+    searched = nearby_search(walk.trace)
     found = list(searched.fewer(guess))
     fewest = solve(walk.trace, CAUSAL, speedups=Speedups.without("annealed")).cost
     assert fewest
@@ -129,7 +126,7 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
     walk = maze(4, 4, steps=1200, seed=0)
     best: list[int] = []
 
-    def stop(self: NearbyEngine, *_: object) -> Generator[list[int], None, str]:
+    def stop(self: NearbySearch, *_: object) -> Generator[list[int], None, str]:
         """When there is a small map, the time is over."""
         best.append(len(set(self._labels)))
         limited.interrupt()
@@ -143,7 +140,7 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
     truth = {state: number for number, state in enumerate(dict.fromkeys(walk.truth))}
     with (
         patch.object(named, "annealed", lambda *_, **__: Mock(labels=lambda chart: _labels_of(chart, walk.truth, truth))),
-        patch.object(NearbyEngine, "_asked", stop),
+        patch.object(NearbySearch, "_asked", stop),
         patch.object(named, "PATIENCE", 100),
         patch.object(named.NamedEngine, "_has_processors", lambda _: beside),
     ):
@@ -200,7 +197,7 @@ def test_what_goes_wrong_in_the_thread_is_raised_where_the_result_is_asked_for()
         yield [0, 1, 0, 1]
         raise ZeroDivisionError
 
-    beside = Beside(nearby_engine(trace), Watch(), found())
+    beside = Beside(nearby_search(trace), Watch(), found())
     while beside.running:
         time.sleep(0.001)
     with pytest.raises(ZeroDivisionError):

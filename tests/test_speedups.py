@@ -18,7 +18,7 @@ from ssh_abduction.apart import apart_from, apartness, clique, far_apart
 from ssh_abduction.chart import Chart
 from ssh_abduction.checker import check
 from ssh_abduction.merging import merged, thinned
-from ssh_abduction.nearby import NearbyEngine
+from ssh_abduction.nearby import NearbySearch
 from ssh_abduction.replay import Log
 
 NAMES = [f.name for f in fields(Speedups)]
@@ -210,7 +210,7 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
     with (
         patch.object(named, "PATIENCE", 1),
         patch.object(annealing, "STEPS", ((0.75, 300),)),
-        patch.object(NearbyEngine, "_take", side_effect=KeyboardInterrupt),
+        patch.object(NearbySearch, "_take", side_effect=KeyboardInterrupt),
     ):
         solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,threads"))
     assert solution.status is Status.FEASIBLE
