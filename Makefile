@@ -1,6 +1,6 @@
 # make demo   install what the lock says into .venv, solve a real route and show the map
 # make bench  time and memory on this machine, ours and those of peers from PyPI, as a table; the better part of an hour
-# make parts  times of single parts: circuits, images, and exploring step by step
+# make parts  times of single parts: circuits, images, exploring step by step, and small traces
 # make test   the same, with the tools of development: lint, types, layers, tests
 PYTHON ?= python3
 BIN := .venv/bin
@@ -24,10 +24,11 @@ lint: .venv/dev
 bench: .venv/bench
 	$(BIN)/python benchmarks/bench.py $(ARGS)
 
-parts: .venv/base
+parts: .venv/dev
 	$(BIN)/python benchmarks/circuits.py
 	$(BIN)/python benchmarks/images.py
 	$(BIN)/python benchmarks/online.py
+	$(BIN)/python benchmarks/conformance.py
 
 lock: .venv/dev
 	$(BIN)/python -m uv pip compile --upgrade --universal --no-header --no-annotate --extra dev --extra bench --python-version 3.11 -o requirements.lock pyproject.toml

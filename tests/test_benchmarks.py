@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import bench
+import conformance
 import plot
 import pytest
 import readme
@@ -66,6 +67,13 @@ def test_a_machine_that_shows_something_else_is_found_out() -> None:
 def test_words_ask_for_the_view_bit_by_bit() -> None:
     words = Words(Trace.from_steps(["a", "b", "c", "b"], ["travel", "right", "travel"]))
     assert [list(words.at(t)) for t in (0, 2)] == [[([], False), (["2"], False)], [(["0", "1"], False), (["0", "1", "2"], True)]]
+
+
+def test_small_traces_are_those_of_the_tables() -> None:
+    found = conformance.cases()
+    assert len(found) > 200
+    assert {theory.level for _, theory in found} == {"causal", "topological"}
+    assert 0 < conformance.milliseconds(*found[0]) < 1000
 
 
 def test_a_cell_has_all_its_fields() -> None:

@@ -1,0 +1,81 @@
+"""Small traces: what `solve` takes for all minimal maps of the traces with known results (tests/test_tables.py), here and in another checkout.
+
+    python benchmarks/conformance.py [CHECKOUT]
+
+Milliseconds of CPU, the least of five runs of each trace in one process. Two processes take turns, trace by trace, so that what else the machine
+does befalls both alike. A single ratio still is as noisy as the machine, so deciles are shown.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from ssh_abduction import Theory, Trace, solve
+
+ROOT = Path(__file__).parent.parent
+RUNS = 5
+
+
+def cases() -> list[tuple[Trace, Theory]]:
+    """The small traces of the tables, and the notched rectangle driven round by parts, each under its theories."""
+    sys.path.insert(0, str(ROOT / "tests"))
+    import test_tables as tables
+
+    small = [tuple(row.values[:2]) for row in tables.test_small_traces.pytestmark[0].args[1]]
+    round_about = [(tables.rectangle(actions), theory) for theory, *_ in tables.NOTCHED for actions in tables.LENGTHS]
+    return [(tables.cornered(trace) if theory.star == "frame" else trace, theory) for trace, theory in small + round_about]
+
+
+def milliseconds(trace: Trace, theory: Theory) -> float:
+    """The least that solving takes."""
+    taken = []
+    for _ in range(RUNS):
+        began = time.process_time()
+        solve(trace, theory, maps=0)
+        taken.append(1000 * (time.process_time() - began))
+    return min(taken)
+
+
+def answer() -> None:
+    """In a process of its own: a file and a theory a line, milliseconds back."""
+    for line in sys.stdin:
+        path, theory = json.loads(line)
+        print(milliseconds(Trace.load(path), Theory.from_dict(theory)), flush=True)
+
+
+def main(other: str | None = None) -> None:
+    checkouts = [str(ROOT), *([other] if other else [])]
+    command = [sys.executable, str(Path(__file__).resolve()), "--answer"]
+    children = [
+        subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        for path in checkouts
+    ]
+    rows: list[list[float]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for number, (trace, theory) in enumerate(cases()):
+            path = Path(folder) / f"{number}.jsonl"
+            trace.save(path)
+            rows.append([])
+            for child in children:
+                assert child.stdin
+                assert child.stdout
+                print(json.dumps([str(path), theory.to_dict()]), file=child.stdin, flush=True)
+                rows[-1].append(float(child.stdout.readline()))
+    for child in children:
+        child.communicate()
+    for path, times in zip(checkouts, zip(*rows, strict=True), strict=True):
+        print(f"{len(times)} traces, {path}: median {statistics.median(times):.1f} ms, most {max(times):.1f} ms")
+    if other:
+        deciles = statistics.quantiles((here / there for here, there in rows), n=10)
+        print(f"ratio of each trace: median {deciles[4]:.2f}, for eight of ten {deciles[0]:.2f} to {deciles[-1]:.2f}")
+
+
+if __name__ == "__main__":
+    answer() if sys.argv[1:] == ["--answer"] else main(*sys.argv[1:2])
