@@ -77,6 +77,7 @@ class NearbySearch(Asker):
         self._configuration = configuration  # of clasp, if not its default
         self._labels: Labels = []
         self._needed: set[int] = set()  # names that cannot be spared
+        self._fewest: dict[int, int] = {}  # by view, spare names that are not taken back, as once they were not enough
         self._allowed: list[int] | None = None  # names that do not help, though all are allowed; None before they were tried one by one
         self._waiting: list[int] = []  # names yet to be allowed
         self._region = FIRST_REGION
@@ -322,7 +323,8 @@ class NearbySearch(Asker):
         """Take a control with more names for the views of these rests."""
         before, taken = self._spare, set(self._labels)
         used = {view: [name for name in spare if name in taken] for view, spare in before.items()}
-        self._take({view: (len(spare) - 1 if spare[-1] in resting else len(used[view])) for view, spare in before.items()})
+        self._fewest |= {view: len(spare) - 1 for view, spare in before.items() if spare[-1] in resting}
+        self._take({view: max(len(names), self._fewest.get(view, 0)) for view, names in used.items()})
         renamed = {old: new for view, names in used.items() for old, new in zip(names, self._spare[view], strict=False)}
         self._label([renamed.get(name, name) for name in self._labels])
 

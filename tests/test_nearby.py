@@ -32,7 +32,7 @@ def nearby_search(trace: Trace) -> NearbySearch:
     pinned = clique(apart, log.seen)
     may_be = [[pinned.index(t)] if t in pinned else (~row[pinned]).nonzero()[0].tolist() for t, row in enumerate(apart)]
     far = far_apart(apart.copy(), log.seen, log.actions)
-    watch = Watch()
+    watch = Watch(100.0)  # so that what does not end fails
     watch.start()
     return NearbySearch(
         watch,
@@ -100,6 +100,33 @@ def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> Non
     for ssh_map in (*some.maps, *every.maps):
         assert check(trace, ssh_map, CAUSAL) == ()
         assert len(ssh_map.dstates) == every.bound.dstates
+
+
+def either_or(parts: int) -> Trace:
+    """In each part of this world there have to be two dstates that show A, or two that show B: minimal maps have any number of either."""
+    views, actions = ["hall"], list[str]()
+    for part in range(parts):
+        p, c, d, e, f = (f"{name}{part}" for name in "pcdef")
+        tours = (f"A x {p} t {c}", f"A x {p} w {e}", f"B z {p} t {c}", f"B z {p} w {f}", f"{p} t {d}")
+        for tour, text in enumerate(tours):
+            words = text.split()
+            actions += [f"to {part} {tour}", *words[1::2], "back"]
+            views += [*words[::2], "hall"]
+    return Trace.from_steps(views, [{"name": action} for action in actions])
+
+
+def test_all_ways_are_listed_whichever_views_need_more_names() -> None:
+    """What one answer needs is not taken back for what the next one needs: that would go on for ever."""
+    trace = either_or(4)
+    expected = solve(trace, CAUSAL, maps=0)
+    searched = nearby_search(trace)
+    for _ in searched.fewer(expected.maps[0].labels):
+        pass
+    assert expected.cost
+    assert searched.bound == expected.cost.dstates
+    watch = Watch(30.0)
+    watch.start()
+    assert {tuple(labels) for labels in searched.listed(watch)} == {ssh_map.labels for ssh_map in expected.maps}
 
 
 @pytest.mark.parametrize("seed", [0, 1])
