@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from itertools import pairwise
 
-from clingo import Function, Model, Number, String, Symbol, SymbolType
+from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 
 from ssh_abduction import encodings
 from ssh_abduction.chart import FramedChart
@@ -153,7 +153,7 @@ def _map(
         dstates=dstates,
         links=links_of(labels, trace),
         places=tuple(place_of.values()),
-        paths=tuple(Path(h, _in_order(h, dstates, pairs)) for h in path_of.values()),
+        paths=_paths(len(path_of), dstates, pairs),
         excused=tuple(sorted((path_of[h], path_of[g]) for h, g in excused if h in path_of and g in path_of)),
     )
 
@@ -376,41 +376,47 @@ def open_labels(labels: Sequence[int]) -> str:
     return "\n".join([*(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)), ":- not violated.", "#show is/2."])
 
 
-def read_streets(model: Model, trace: Trace, chart: FramedChart, labels: Sequence[int]) -> SSHMap:
-    """The map of the dstates that label the nodes, with the places and paths of an answer set of streets.lp."""
-    at: dict[int, tuple[int, int]] = {}
-    stands: dict[int, tuple[int, int]] = {}
-    part: dict[int, tuple[int, int]] = {}
-    runs: dict[int, tuple[int, int]] = {}
-    order: list[tuple[int, int, int]] = []
-    for name, args in map(_atom, model.symbols(shown=True)):
-        if name == "before":
-            order.append((args[0], args[1], args[2]))
-        else:
-            {"at": at, "stands": stands, "course": part, "runs": runs}[name][args[0]] = (args[1], args[2])
-    is_at: dict[int, int] = {}
-    place: dict[int, int] = {}
-    course: dict[int, tuple[int, int]] = {}
-    heading: dict[int, int] = {}
-    first: dict[int, int] = {}  # step at a dstate
-    arrived: dict[int, tuple[int, int]] = {}  # of each place, the first step there and the slot it faces
-    faced: dict[int, tuple[int, int]] = {}  # of each path, its number and the direction that was faced first
-    for t, node in enumerate(chart.node_of):
-        s = labels[node]
-        is_at[t] = first.setdefault(s, t)
-        if is_at[t] < t:
-            continue
-        component, slot = stands[s]
-        p, turned = at[component]
-        place[t], facing = arrived.setdefault(p, (t, (slot + turned) % 4))
-        heading[t] = (slot + turned - facing) % 4
-        if s in runs:
-            stretch, sign = runs[s]
-            path, direction = part[stretch]
-            number, ahead = faced.setdefault(path, (len(faced), sign * direction))
-            course[t] = (number, sign * direction * ahead)
-    before = [(faced[h][0], *((arrived[p][0], arrived[q][0]) if faced[h][1] == 1 else (arrived[q][0], arrived[p][0]))) for h, p, q in order]
-    return _map(trace, is_at, place, course, heading, before)
+class StreetReader:
+    """Reads the maps of one labelling of nodes from answers of streets.lp; what the labels alone tell is worked out once."""
+
+    def __init__(self, control: Control, trace: Trace, chart: FramedChart, labels: Sequence[int]) -> None:
+        stands, runs = (
+            {args[0]: (args[1], args[2]) for _, args in (_atom(atom.symbol) for atom in control.symbolic_atoms.by_signature(name, 3))}
+            for name in ("stands", "runs")
+        )
+        first: dict[int, int] = {}  # step at a dstate, by its label
+        for t, node in enumerate(chart.node_of):
+            first.setdefault(labels[node], t)
+        number = {label: i for i, label in enumerate(first)}
+        self._labels = tuple(number[labels[node]] for node in chart.node_of)
+        self._links = links_of(self._labels, trace)
+        self._dstates = [(_view(trace, t), *stands[label], runs.get(label)) for label, t in first.items()]
+
+    def __call__(self, model: Model) -> SSHMap:
+        at: dict[int, tuple[int, int]] = {}
+        part: dict[int, tuple[int, int]] = {}
+        order: list[tuple[int, int, int]] = []
+        for name, (a, b, c) in map(_atom, model.symbols(shown=True)):
+            if name == "before":
+                order.append((a, b, c))
+            else:
+                (at if name == "at" else part)[a] = (b, c)
+        arrived: dict[int, tuple[int, int]] = {}  # of each place, its number and the slot that is faced first
+        faced: dict[int, tuple[int, int]] = {}  # of each path, its number and the direction that is faced first
+        dstates: list[DState] = []
+        for view, component, slot, run in self._dstates:
+            p, turned = at[component]
+            place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
+            path = direction = None
+            if run is not None:
+                h, ahead = part[run[0]]
+                ahead *= run[1]
+                path, first = faced.setdefault(h, (len(faced), ahead))
+                direction = ahead * first
+            dstates.append(DState(len(dstates), view, place, path, direction, (slot + turned - facing) % 4))
+        before = ((*faced[h], arrived[p][0], arrived[q][0]) for h, p, q in order)
+        ordered = [(path, p, q) if first == 1 else (path, q, p) for path, first, p, q in before]
+        return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(arrived))), _paths(len(faced), dstates, ordered))
 
 
 def links_of(labels: Sequence[int], trace: Trace) -> tuple[tuple[int, str, int], ...]:
@@ -424,8 +430,13 @@ def _view(trace: Trace, step: int) -> str | int:
     return view
 
 
-def _in_order(path: int, dstates: Sequence[DState], before: Sequence[tuple[int, int, int]]) -> tuple[int, ...]:
-    """The places on a path, each behind the ones that are before it: in a strict order it has more of those than they have."""
-    on_path = {s.place for s in dstates if s.path == path and s.place is not None}
-    behind = {p: sum(h == path and q == p and o in on_path for h, o, q in before) for p in on_path}
-    return tuple(sorted(on_path, key=lambda p: (behind[p], p)))
+def _paths(count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]) -> tuple[Path, ...]:
+    """Paths with their places, each behind the ones that are before it: in a strict order it has more of those than they have."""
+    behind: list[dict[int, int]] = [{} for _ in range(count)]  # of each place on a path, how many are before it
+    for s in dstates:
+        if s.path is not None and s.place is not None:
+            behind[s.path][s.place] = 0
+    for path, p, q in before:
+        if p in behind[path] and q in behind[path]:
+            behind[path][q] += 1
+    return tuple(Path(path, tuple(sorted(found, key=lambda p: (found[p], p)))) for path, found in enumerate(behind))

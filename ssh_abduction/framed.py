@@ -317,11 +317,11 @@ class FramedEngine(SameEngine):
 
     def _maps(self, naming: _Naming, mode: str, conflicts: int = -1) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
-        labels = naming.labels
-        control = naming.control or self._street_control(labels)
+        control = naming.control or self._street_control(naming.labels)
+        read_map = facts.StreetReader(control, self._trace, self._chart, naming.labels)
 
         def read(model: clingo.Model) -> Found:
-            found = facts.read_streets(model, self._trace, self._chart, labels)
+            found = read_map(model)
             counts = {"dstates": len(found.dstates), "places": len(found.places), "paths": len(found.paths)}
             return Found(found, tuple(counts[preferred] for preferred in self._theory.priorities))
 

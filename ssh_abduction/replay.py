@@ -61,6 +61,8 @@ class Log:
         """Replay the trace over the map that `labels` make of its first steps; `known` of them make links (default all)."""
         actions, seen = self.actions, self.seen
         known = len(labels) if known is None else known
+        if known == len(seen):
+            return Replay(tuple(labels), Outcome.PREDICTED)
         links = {(labels[t], actions[t]): labels[t + 1] for t in range(known - 1)}
         sights = {(labels[t], seen[t]) for t in range(known)}
         found = list(labels[:known])
