@@ -50,6 +50,7 @@ ROUGH, ROUGH_VISITS = ((0.6, 300), *10 * ((0.75, 150),)), 40
 # And where each step is a visit; the last again and again, until whoever asks is content.
 STEPS = (0.75, 1500), (0.75, 500)
 ENTRIES = 60_000_000  # of the table of transitions, that are looked up for all steps in one go: 12 bytes each
+TABLE = 2_000_000  # of the table of transitions itself, states x actions x states, which is made anew for each sweep: some 20 bytes each
 SECONDS = 10.0  # after which there is no other attempt
 COLD = 0.95  # to what power in the last of them
 LAST, QUENCHED = 50, 4.0  # sweeps at the end, so that little is left to chance, and to what power then
@@ -127,9 +128,11 @@ def annealed_steps(
     check   called now and then, and may raise
     """
     options = _step_options(chart, clique, may_be)
-    if options.size * options.shape[1] > ENTRIES:
+    leaves = [(0, action) for _, action, _ in chart.links]
+    actions = len(set(leaves))
+    if options.size * options.shape[1] > ENTRIES or (int(options.max()) + 1) ** 2 * actions > TABLE:
         return
-    drawn = _Drawn(options, [(0, action) for _, action, _ in chart.links], 1, np.random.default_rng(0))
+    drawn = _Drawn(options, leaves, 1, np.random.default_rng(0))
     for first, sweeps in chain(STEPS, repeat(STEPS[-1])):
         drawn.anneal(first, sweeps, check)
         yield np.where(drawn.sure(), drawn.labels, -1).tolist()

@@ -21,17 +21,17 @@ CORES conflicts the numbers of dstates are asked for one by one instead, from th
 there is none, the bound is one higher. The first answer without a rest is a minimal map, as it costs what the bound is; the same
 search then goes on with the other maps.
 
-Beside all that small maps are sought in a thread of its own, or where there is but one processor, first and not for long. First steps are merged by
-evidence (`merging.py`), so that a limit leaves a map that is not bad; then a map is guessed, of places with frames where the trace lets itself be
-taken for one of these (`annealing.py`), and smaller ones are sought near it (`nearby.py`). Whatever bound meets them ends the search.
-Where there is no such search, clasp has the second processor: two threads, which tell each other what they learn.
+Beside all that small maps are sought in a thread of its own. First steps are merged by evidence (`merging.py`), so that a limit leaves a map that is
+not bad; then a map is guessed, of places with frames where the trace lets itself be taken for one of these (`annealing.py`), and smaller ones are
+sought near it (`nearby.py`). Whatever bound meets them ends the search. Where there is but one processor, steps are merged at once, and the guess
+waits until raising the bound by cores has stalled. Where there is no such search, clasp has the second processor: two threads, which tell each other what they learn.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, TypeAlias
 
 import clingo
@@ -57,7 +57,7 @@ SPARES = 2  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
 CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
 GUESSES = 10  # that are waited for until one is a map, where the robot does not turn
-TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside it
+TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside that
 
 
 _Trail: TypeAlias = "tuple[Link, _Trail] | None"
@@ -65,6 +65,14 @@ _Trail: TypeAlias = "tuple[Link, _Trail] | None"
 
 class _Settled(Exception):  # noqa: N818 - not an error
     """A map is known that has as few dstates as the bound."""
+
+
+def _ever_fewer(found: Iterable[list[int]], known: list[int] | None = None) -> Iterator[list[int]]:
+    """Those labels that are fewer than all before them."""
+    for labels in found:
+        if known is None or len(set(labels)) < len(set(known)):
+            known = labels
+            yield labels
 
 
 class NamedEngine(ChartedEngine):
@@ -160,6 +168,8 @@ class NamedEngine(ChartedEngine):
                     self._hard = True
                     yield from self._search_nearby()
                 if not lazy:
+                    if not self._has_processors():
+                        yield from self._search_alone()
                     self._ask_one_by_one()
                     continue
                 self._add(self._chart.links)
@@ -174,12 +184,33 @@ class NamedEngine(ChartedEngine):
         yield self._follow(self._first_of_bound())[0]
 
     def _search_nearby(self) -> Iterator[list[int]]:
-        """Begin to search for small maps in another thread; or search for a while, and give what is found."""
+        """Begin to search for small maps in another thread; where there is but one processor, give a map merged by evidence."""
         if len(self._chart.seen) > AT_ONCE or not (self._speedups.greedy or self._speedups.annealed):
             return
-        beside = self._has_processors()
-        watch = Watch(beside=self._watch) if beside else self._watch
-        search = NearbySearch(
+        if self._has_processors():
+            watch = Watch(beside=self._watch)
+            search = self._nearby(watch)
+            found = chain(self._merged(watch.check), self._near_guess(search, watch.check))
+            self._beside = Beside(search, watch, _ever_fewer(found))
+            return
+        for labels in self._merged(self._watch.check):
+            self._heed(labels, 0)
+            yield labels
+
+    def _search_alone(self) -> Iterator[list[int]]:
+        """Search for small maps near a guess for a while, with nothing beside it. Raises _Settled where one has fewest dstates."""
+        if len(self._chart.seen) > AT_ONCE:
+            return
+        search = self._nearby(self._watch)
+        for labels in _ever_fewer(self._near_guess(search, self._watch.check, TRIES), self._known):
+            self._heed(labels, 0)
+            yield labels
+        if search.bound:
+            self._heed(self._known, search.bound)
+            raise _Settled
+
+    def _nearby(self, watch: Watch) -> NearbySearch:
+        return NearbySearch(
             watch,
             self._speedups,
             chart=self._chart,
@@ -188,33 +219,21 @@ class NamedEngine(ChartedEngine):
             far=self._far,
             configuration="tweety",
         )
-        found = self._fewer_labels(search, watch.check, None if beside else TRIES)
-        if beside:
-            self._beside = Beside(search, watch, found)
-            return
-        for labels in found:
-            self._heed(labels, 0)
-            yield labels
-        if search.bound:
-            self._heed(self._known, search.bound)
-            raise _Settled
 
-    def _fewer_labels(self, search: NearbySearch, check: Callable[[], None], tries: int | None) -> Iterator[list[int]]:
-        """Labels, each time fewer: of a map merged by evidence, of one that is guessed, and of those near that."""
-        apart, links = self._chart.apart(AT_ONCE), self._chart.links
-        fewest = len(self._chart.seen) + 1
+    def _merged(self, check: Callable[[], None]) -> Iterator[list[int]]:
+        """Labels of a map merged by evidence."""
         if self._speedups.greedy:
-            labels = merged(apart, links, self.clique, check)
-            fewest = len(set(labels))
-            yield labels
+            yield merged(self._chart.apart(AT_ONCE), self._chart.links, self.clique, check)
+
+    def _near_guess(self, search: NearbySearch, check: Callable[[], None], tries: int | None = None) -> Iterator[list[int]]:
+        """Labels of a map that is guessed, and of those near that."""
         guess = self._guessed(check) if self._speedups.annealed else None
         if guess is None:
             return
+        apart, links = self._chart.apart(AT_ONCE), self._chart.links
         known = thinned(apart, links, merged_near(apart, links, guess, check), check)
         del apart  # as large as steps x steps
-        for labels in search.fewer(known, tries):
-            if len(set(labels)) < fewest:
-                yield labels
+        yield from search.fewer(known, tries)
 
     def _guessed(self, check: Callable[[], None]) -> list[int] | None:
         """A guess at the dstates of all steps, -1 where it is not sure; None where that would take too much memory."""
@@ -333,20 +352,24 @@ class NamedEngine(ChartedEngine):
             held: list[list[int]] = []
             failed: Iterable[Link] = ()
             lazy = len(self._links) < len(self._chart.links)
-            for answer in self._all_of_bound(spares):
-                labels, failed = self._follow(answer)
-                if failed:
-                    break
-                held.append(labels)
-                if enough:
-                    if len(held) == enough:
-                        yield from held
-                        return
-                elif not lazy:
-                    yield held.pop()
-                elif len(held) == HELD_BACK:
-                    failed = self._chart.links
-                    break
+            try:
+                for answer in self._all_of_bound(spares):
+                    labels, failed = self._follow(answer)
+                    if failed:
+                        break
+                    held.append(labels)
+                    if enough:
+                        if len(held) == enough:
+                            yield from held
+                            return
+                    elif not lazy:
+                        yield held.pop()
+                    elif len(held) == HELD_BACK:
+                        failed = self._chart.links
+                        break
+            except Stopped:
+                yield from held  # they cost what the bound is, and fit all links
+                raise
             if failed:
                 self._add(failed)
             elif not enough or not self._needs_rest(spares):

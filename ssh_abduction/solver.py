@@ -273,6 +273,7 @@ class Search:
             self._start = len(trace) if after.status is Status.OPTIMAL else max(FIRST_PREFIX, self._engine.size_to_go_on)
         if minimal is not None:
             self.status, self.best, self._cost = Status.OPTIMAL, minimal, after._cost
+            self._raise_bound(self._cost[0] if self._cost else None)
 
     def _names_pay(self) -> bool:
         """Whether the theory lets dstates have names beforehand, and the trace is long enough for that to pay."""

@@ -12,6 +12,7 @@ import sys
 import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import networkx as nx
 import pytest
@@ -145,6 +146,19 @@ def test_ctrl_c_prints_what_is_known(tmp_path: Path) -> None:
     data = json.loads((tmp_path / "out.json").read_text())
     assert (data["stopped"], data["complete"], data["status"]) == ("interrupted", False, "optimal")
     assert data["count"] == len(data["maps"]) > 0
+
+
+def test_ctrl_c_while_the_end_is_printed_leaves_it_whole(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    from ssh_abduction.cli import solve as verb
+
+    def ending(*args: Any) -> dict[str, Any]:
+        signal.raise_signal(signal.SIGINT)
+        return end(*args)
+
+    end = verb.ending
+    monkeypatch.setattr(verb, "ending", ending)
+    assert main(["solve", ACES, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["complete"]
 
 
 def test_check_accepts_what_solve_found(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:

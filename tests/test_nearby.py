@@ -168,7 +168,7 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
     with (
         patch.object(named, "annealed", lambda *_, **__: Mock(labels=lambda chart: _labels_of(chart, walk.truth, truth))),
         patch.object(NearbySearch, "_asked", stop),
-        patch.object(named, "PATIENCE", 100),
+        patch.multiple(named, PATIENCE=100, CORES=100),
         patch.object(named.NamedEngine, "_has_processors", lambda _: beside),
     ):
         solution = limited.solution(tuple(limited))

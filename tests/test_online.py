@@ -25,10 +25,12 @@ from ssh_abduction.speedups import Speedups
 NO_TIME = 1e-9  # seconds: every search is stopped before it begins
 
 
-def follow(trace: Trace, theory: Theory, limit: float | None = None, maps: int = 0) -> tuple[OnlineMapper, list[Solution]]:
+def follow(
+    trace: Trace, theory: Theory, limit: float | None = None, maps: int = 0, speedups: Speedups | None = None
+) -> tuple[OnlineMapper, list[Solution]]:
     """The mapper at the end of a trace, and its answers after each step."""
     first, *rest = trace.steps
-    mapper = OnlineMapper(first.view or "", theory, star=first.star, limit=limit, maps=maps)
+    mapper = OnlineMapper(first.view or "", theory, star=first.star, limit=limit, maps=maps, speedups=speedups or Speedups())
     answers = [mapper.solution]
     for action, step in zip(trace.actions, rest, strict=True):
         answers.append(mapper.observe(action, step.view or "", star=step.star))
@@ -66,13 +68,24 @@ def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
 def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
     theory = data.draw(theories(trace), label="theory").resolve(trace)
-    _, answers = follow(trace, theory, maps=2)
+    _, answers = follow(trace, theory, maps=2, speedups=Speedups(prefixes=data.draw(st.booleans(), label="prefixes")))
     for i, answer in enumerate(answers):
         anew = solve(trace.prefix(i + 1), theory, maps=0)
         assert answer.status is anew.status
+        assert answer.bound == anew.bound or answer.status is Status.UNSATISFIABLE
         assert answer.count == min(2, anew.count)
         assert set(answer.maps) <= set(anew.maps)
         assert not answer.complete or answer.count == anew.count
+
+
+def test_a_bound_is_known_where_more_maps_of_a_known_cost_are_asked_for() -> None:
+    """Where clingo is given the whole trace at each step, too."""
+    actions = "R R R R R V T R R V R R C R C R T R T V R V".split()
+    named = {"R": "right", "T": "travel", "V": Action("veer", "turn", "right"), "C": Action("creep", "travel")}
+    trace = Trace.from_steps("00110010110010101010110", [named[action] for action in actions])
+    mapper, answers = follow(trace, Theory.causal(), speedups=Speedups.without("prefixes"))
+    assert [answer.bound.dstates for answer in answers] == [answer.cost.dstates for answer in answers if answer.cost]
+    assert mapper.searches > 1
 
 
 @pytest.mark.parametrize("theory", [Theory.causal(), Theory.topological(), Theory.circumscriptive()], ids=["causal", "dstates", "paths"])

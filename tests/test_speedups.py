@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import fields
-from itertools import product
+from itertools import islice, product
 from unittest.mock import patch
 
 import pytest
@@ -15,6 +16,7 @@ from strategies import traces
 from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, annealing, engine, facts, named, solve, solver
 from ssh_abduction.annealing import annealed_steps
 from ssh_abduction.apart import apart_from, apartness, clique, far_apart
+from ssh_abduction.asking import Stopped
 from ssh_abduction.chart import Chart
 from ssh_abduction.checker import check
 from ssh_abduction.merging import merged, thinned
@@ -208,7 +210,7 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
     """Of a machine that does not turn."""
     walk = moore(12, 2, steps=800, seed=seed)
     with (
-        patch.object(named, "PATIENCE", 1),
+        patch.multiple(named, PATIENCE=1, CORES=1),
         patch.object(annealing, "STEPS", ((0.75, 300),)),
         patch.object(NearbySearch, "_take", side_effect=KeyboardInterrupt),
     ):
@@ -219,8 +221,27 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
     assert check(walk.trace, solution.maps[0], Theory.causal()) == ()
 
 
+@pytest.mark.parametrize("off", ["", "lazy"])
+def test_maps_found_before_a_limit_strikes_are_given(off: str) -> None:
+    """Though they are held back until it is known that the links that clingo was given are enough."""
+    found = named.NamedEngine._all_of_bound
+
+    def stopped(self: named.NamedEngine, spares: int) -> Iterator[dict[int, int]]:
+        yield from islice(found(self, spares), 3)
+        raise Stopped("time limit")
+
+    walk = maze(3, 3, steps=200, seed=0)
+    with patch.object(named.NamedEngine, "_all_of_bound", stopped):
+        solution = solve(walk.trace, Theory.causal(), maps=100, speedups=Speedups.without(off))
+    assert (solution.status, solution.count, solution.stopped) == (Status.OPTIMAL, 3, "time limit")
+    for ssh_map in solution.maps:
+        assert check(walk.trace, ssh_map, Theory.causal()) == ()
+
+
 def test_a_guess_that_takes_too_much_memory_is_not_begun() -> None:
     walk = moore(8, 2, steps=100, seed=0)
     chart = Chart.of_steps(Log(walk.trace, Theory.causal()), 101)
-    with patch.object(annealing, "ENTRIES", 100):
-        assert list(annealed_steps(chart, [0], [[0]] * 101)) == []
+    for most in ("ENTRIES", "TABLE"):
+        assert next(annealed_steps(chart, [0], [[0]] * 101))
+        with patch.object(annealing, most, 100):
+            assert list(annealed_steps(chart, [0], [[0]] * 101)) == []

@@ -57,24 +57,25 @@ def run(options: argparse.Namespace) -> int:
 
         return batch.run(options)
     trace = Trace.load(options.traces[0])
-    with _progress(trace) as on_progress:
-        search = Search(
-            trace,
-            theory_of(options),
-            limit=options.time_limit,
-            maps=options.maps,
-            memory=options.memory_limit,
-            speedups=Speedups.without(options.without_speedups),
-            on_progress=on_progress,
-        )
-        with on_ctrl_c(search.interrupt):
+    with contextlib.ExitStack() as until_printed:
+        with _progress(trace) as on_progress:
+            search = Search(
+                trace,
+                theory_of(options),
+                limit=options.time_limit,
+                maps=options.maps,
+                memory=options.memory_limit,
+                speedups=Speedups.without(options.without_speedups),
+                on_progress=on_progress,
+            )
+            until_printed.enter_context(on_ctrl_c(search.interrupt))  # half of what is printed would be worth nothing
             kept = _print_json(search) if options.json else list(_first(search, SHOWN))
             explanation = explained(search)
         solution = search.solution(tuple(kept))
-    if options.json:
-        _print_end(search, solution, explanation)
-    else:
-        _print_text(search, solution, explanation)
+        if options.json:
+            _print_end(search, solution, explanation)
+        else:
+            _print_text(search, solution, explanation)
     return exit_code(solution)
 
 
