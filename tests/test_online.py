@@ -80,7 +80,7 @@ def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
 
 def test_a_bound_is_known_where_more_maps_of_a_known_cost_are_asked_for() -> None:
     """Where clingo is given the whole trace at each step, too."""
-    actions = "R R R R R V T R R V R R C R C R T R T V R V".split()
+    actions = "RRRRRVTRRVRRCRCRTRTVRV"
     named = {"R": "right", "T": "travel", "V": Action("veer", "turn", "right"), "C": Action("creep", "travel")}
     trace = Trace.from_steps("00110010110010101010110", [named[action] for action in actions])
     mapper, answers = follow(trace, Theory.causal(), speedups=Speedups.without("prefixes"))
