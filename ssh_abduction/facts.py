@@ -226,7 +226,14 @@ def used(name: int) -> Symbol:
 
 def read_names(model: Model) -> dict[int, int]:
     """The name of each step that an answer set of names.lp speaks of."""
-    return {s.arguments[0].number: s.arguments[1].number for s in model.symbols(shown=True)}
+    return dict(map(_named, model.symbols(shown=True)))
+
+
+@lru_cache(maxsize=2**16)
+def _named(symbol: Symbol) -> tuple[int, int]:
+    """A step and its name. Kept, as answers that follow each other have most atoms in common, and each part is a call to clingo."""
+    step, name = symbol.arguments
+    return step.number, name.number
 
 
 def visit_facts(
