@@ -13,7 +13,7 @@ demo: .venv/base
 	$(BIN)/python examples/demo.py out
 
 test: lint
-	$(BIN)/pytest -n auto
+	$(BIN)/pytest -n auto --dist worksteal
 
 lint: .venv/dev
 	$(BIN)/ruff check .

@@ -242,6 +242,7 @@ def test_a_guess_that_takes_too_much_memory_is_not_begun() -> None:
     walk = moore(8, 2, steps=100, seed=0)
     chart = Chart.of_steps(Log(walk.trace, Theory.causal()), 101)
     for most in ("ENTRIES", "TABLE"):
-        assert next(annealed_steps(chart, [0], [[0]] * 101))
+        with patch.object(annealing, "STEPS", ((0.75, 5),)):
+            assert next(annealed_steps(chart, [0], [[0]] * 101))
         with patch.object(annealing, most, 100):
             assert list(annealed_steps(chart, [0], [[0]] * 101)) == []
