@@ -25,13 +25,14 @@ which is at least what was proved before. A theory `without` axioms is solved an
 
 When time is short
 ------------------
-A map that predicts the step is minimal even if there is no time to look for others. Once there is none, the answer is feasible: the last bound, which
-holds for the longer trace by (1), and a map. That is a map of fewer steps that goes on like a sketch (`sketch.py`), and that the checker finds
-consistent; or a sketch of all steps. Where places have frames, a map that is contradicted is mended: what does not fit is something new. clingo is asked again when the trace is longer by RETRY and PAUSE; it goes on where it was stopped, and may
-prove a map minimal again.
+A map that predicts the step is minimal even if there is no time to look for others. Once there is none, the answer is feasible: the last
+bound, which holds for the longer trace by (1), and a map. That is a map of fewer steps that goes on like a sketch (`sketch.py`), and that the
+checker finds consistent; or a sketch of all steps. Where places have frames, a map that is contradicted is mended: what does not fit is
+something new. clingo is asked again when the trace is longer by RETRY and PAUSE; it goes on where it was stopped, and may prove a map minimal
+again.
 
-Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`guessing.py`), one after another, in a thread of their own,
-and mended there where that takes longer than a step may.
+Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`guessing.py`), one after another, in a thread
+of their own, and mended there where that takes longer than a step may.
 """
 
 from __future__ import annotations
