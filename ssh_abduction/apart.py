@@ -86,9 +86,12 @@ def _filled(apart: Matrix, kept: list[int], random: np.random.Generator) -> list
     left = np.flatnonzero(apart[kept].all(axis=0)) if kept else np.arange(len(apart))
     found = list(kept)
     inner = apart[np.ix_(left, left)]
-    while len(left):
-        best = int((inner.sum(axis=1) + random.random(len(left))).argmax())
+    degree = inner.sum(axis=0)
+    free = np.arange(len(left))  # of those left, the ones that are apart from all found
+    while len(free):
+        best = free[int((degree[free] + random.random(len(free))).argmax())]
         found.append(int(left[best]))
-        stay = np.flatnonzero(inner[best])
-        left, inner = left[stay], inner[np.ix_(stay, stay)]
+        stay = inner[best, free]
+        degree -= inner[free[~stay]].sum(axis=0)  # each is left out once, so a whole clique costs no more than the matrix is large
+        free = free[stay]
     return found
