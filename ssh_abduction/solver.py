@@ -533,8 +533,12 @@ class Search:
                 return
             if streaming:
                 streamed.append(self.prefix)
-            self._engine.grow(self._engine.next_size(stuck))
-            self._name_paths(self._cost)
+            try:
+                self._engine.grow(self._engine.next_size(stuck))
+                self._name_paths(self._cost)
+            except Stopped:
+                yield from held
+                raise
 
     def _salvage(self) -> None:
         """In the last part of the time limit, look for any map of the whole trace."""

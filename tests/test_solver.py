@@ -11,7 +11,7 @@ import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -379,6 +379,28 @@ def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPa
     solution = search.solution(maps)
     assert (solution.count, len(set(maps)), solution.complete, solution.stopped) == (200, 200, False, "interrupted")
     assert solution.status is Status.OPTIMAL
+
+
+def test_a_stop_while_the_prefix_grows_gives_the_maps_that_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(solver_module, "FIRST_PREFIX", 2)
+    given = 0
+    for seed in (1, 4, 6):
+        trace = wandering(seed, rooms=4, length=14, views=2)
+        every = set(solve(trace, Theory.causal(), maps=0).maps)
+        search = Search(trace, Theory.causal(), maps=0)
+        grow = search._engine.grow
+
+        def stopped(size: int, search: Search = search, grow: Callable[[int], None] = grow) -> None:
+            if search.status is Status.OPTIMAL:
+                raise solver_module.Stopped("time limit")
+            grow(size)
+
+        monkeypatch.setattr(search._engine, "grow", stopped)
+        maps = set(search)
+        assert maps <= every
+        assert search.stopped == "time limit"
+        given += len(maps)
+    assert given
 
 
 def test_a_search_runs_once() -> None:
