@@ -383,7 +383,7 @@ def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPa
 
 def test_a_stop_while_the_prefix_grows_gives_the_maps_that_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solver_module, "FIRST_PREFIX", 2)
-    given = 0
+    given = []
     for seed in (1, 4, 6):
         trace = wandering(seed, rooms=4, length=14, views=2)
         every = set(solve(trace, Theory.causal(), maps=0).maps)
@@ -399,8 +399,8 @@ def test_a_stop_while_the_prefix_grows_gives_the_maps_that_replayed(monkeypatch:
         maps = set(search)
         assert maps <= every
         assert search.stopped == "time limit"
-        given += len(maps)
-    assert given
+        given.append(len(maps))
+    assert max(given) > 1  # one is always known
 
 
 def test_a_search_runs_once() -> None:
