@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 from ssh_abduction import encodings
@@ -118,7 +119,7 @@ class Theory:
             return ("excuses", *self.prefer)
         return self.prefer
 
-    @property
+    @cached_property
     def axioms(self) -> tuple[str, ...]:
         """The names of the axioms that hold. With star=auto, those of a trace without stars."""
         return tuple(a.name for a in encodings.axioms() if a.name not in self.without and a.holds_in(vars(self)))

@@ -69,7 +69,7 @@ def test_prefixes_of_random_machines(seed: int) -> None:
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)
-@given(traces(max_steps=9).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory))))
+@given(traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory))))
 def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
     """Every prefix is tried, from the shortest, so that replay has all chances to go wrong."""
     trace, theory = case
