@@ -46,7 +46,7 @@ from ssh_abduction.asking import POLL, Stopped, Watch, new_control
 from ssh_abduction.chart import Chart, Link, NoFrame, numbered
 from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found
 from ssh_abduction.merging import merged, merged_near, thinned
-from ssh_abduction.nearby import AT_A_TIME, Beside, NearbySearch, mended
+from ssh_abduction.nearby import AT_A_TIME, SECONDS_A_CHARACTER, Beside, NearbySearch, mended
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
@@ -410,9 +410,9 @@ class NamedEngine(ChartedEngine):
             for t, options in enumerate(self._may_be)
         ]
         cores = ["--opt-strategy=usc"] if self._speedups.core_guided else []
-        self._control = new_control(
-            "names", facts.name_facts(names, spares.values(), self._chart.links, self._choices), ["--eq=1", *cores], self._speedups
-        )
+        base = facts.name_facts(names, spares.values(), self._chart.links, self._choices)
+        self._check_ahead(SECONDS_A_CHARACTER * len(base))
+        self._control = new_control("names", base, ["--eq=1", *cores], self._speedups)
         self._configure()
         self._given: set[int] = set()  # nodes
         self._open = np.zeros(len(seen), dtype=bool)  # whether a node is one of them, and not pinned

@@ -45,6 +45,7 @@ FIRST_REGION = 10  # dstates of such a part, at first and at least
 LARGER, SMALLER = 2, 4  # dstates that it gets more where it cannot have fewer, and less where that was left open
 PREPARING = 1.0  # times as long as grounding took, about, clingo prepares to solve, and cannot be stopped
 AT_A_TIME = 100  # links that clingo is given in one go
+SECONDS_A_CHARACTER = 1e-6  # that clingo takes, at most about, to read and ground where names lead: it cannot be stopped meanwhile
 
 Labels: TypeAlias = list[int]
 _Key: TypeAlias = tuple[int, int]  # what is seen at a node, and its label
@@ -149,6 +150,7 @@ class NearbySearch(Asker):
         self._choices = [options if t in pinned else [*options, *self._spare[seen[t]]] for t, options in enumerate(map(list, self._may_be))]
         links = self._chart.links
         base = facts.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
+        self._watch.check(SECONDS_A_CHARACTER * len(base))
         self._control = new_control("names", base, ["--eq=1"], self._speedups)
         if self._configuration:
             configuration: Any = self._control.configuration

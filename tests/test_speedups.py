@@ -246,3 +246,14 @@ def test_a_guess_that_takes_too_much_memory_is_not_begun() -> None:
             assert next(annealed_steps(chart, [0], [[0]] * 101))
         with patch.object(annealing, most, 100):
             assert list(annealed_steps(chart, [0], [[0]] * 101)) == []
+
+
+def test_what_cannot_be_stopped_is_not_begun_where_time_is_short() -> None:
+    """clingo is not told where names lead, if the limit would be over before it can be stopped. The clique is a bound by then."""
+    walk = moore(8, 2, steps=100, seed=0)
+    with patch.object(named, "SECONDS_A_CHARACTER", 1.0), patch.object(named, "new_control", side_effect=AssertionError):
+        solution = solve(walk.trace, Theory.causal(), limit=30, speedups=Speedups.without("prefixes"))
+    assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
+    assert solution.certificate
+    assert solution.bound.dstates == len(solution.certificate.clique) > 2
+    assert check(walk.trace, solution.maps[0], Theory.causal()) == ()
