@@ -37,6 +37,10 @@ class Stopped(Exception):  # noqa: N818 - not an error
         self.reason = reason
 
 
+class Paused(Exception):  # noqa: N818 - not an error
+    """Something else is to be done first."""
+
+
 class Watch:
     """The limits of a search: `check` raises when one is over. Time that the caller of a stream takes does not count.
 
@@ -62,6 +66,7 @@ class Watch:
         self._memory = memory
         self._started: float | None = None
         self._spent = 0.0
+        self._pause_at = math.inf
         self.interrupted = False
 
     def start(self) -> None:
@@ -82,6 +87,10 @@ class Watch:
     def stop(self) -> None:
         self._spent, self._started = self.elapsed(), None
 
+    def pause_after(self, seconds: float) -> None:
+        """Let `check` raise Paused, once, when so much time was spent."""
+        self._pause_at = seconds
+
     def elapsed(self) -> float:
         return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
 
@@ -96,6 +105,9 @@ class Watch:
             raise Stopped("time limit")
         if self._memory is not None and peak_memory() > self._memory:
             raise Stopped("memory limit")
+        if self.elapsed() > self._pause_at:
+            self._pause_at = math.inf
+            raise Paused
 
     def allows(self, seconds: float) -> bool:
         """Whether there is time for so many seconds of what cannot be interrupted."""

@@ -79,6 +79,11 @@ class Chart:
         A guess: the causal theory does not say that turns rotate. Raises NoFrame where some action is neither turn nor travel, or where
         what is seen after a turn does not follow from what was seen before.
         """
+        return Chart.framed(trace, log, size, Chart.around(trace, log, size))
+
+    @staticmethod
+    def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]]:
+        """What is seen ahead, right, back and left where something is seen ahead, as turns show. Raises NoFrame as `turned` does."""
         after: dict[tuple[int, int], int] = {}  # what is seen, and quarters to the right: what is seen then
         for action, before, then in zip(trace.actions[: size - 1], log.seen, log.seen[1:], strict=False):
             if action.kind is None:
@@ -87,8 +92,7 @@ class Chart:
                 quarters = QUARTERS[action.turn]
                 if after.setdefault((before, quarters), then) != then or after.setdefault((then, 4 - quarters), before) != before:
                     raise NoFrame
-        around = {seen: _around(seen, after) for seen in dict.fromkeys(log.seen[:size])}
-        return Chart.framed(trace, log, size, around)
+        return {seen: _around(seen, after) for seen in dict.fromkeys(log.seen[:size])}
 
     @staticmethod
     def framed(trace: Trace, log: Log, size: int | None = None, around: Mapping[int, Sequence[int]] | None = None) -> FramedChart:

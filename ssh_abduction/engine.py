@@ -71,8 +71,11 @@ class Engine(Asker):
         """An engine for a trace that this one's has grown to, under other limits."""
         raise NotImplementedError
 
-    def improving_maps(self) -> Iterator[Found]:
-        """Maps of the prefix, each better than the one before; where the iteration ends, the last one is minimal."""
+    def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
+        """Maps of the prefix, each better than the one before; where the iteration ends, the last one is minimal.
+
+        most  what they cost at most, if that is known
+        """
         raise NotImplementedError
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
@@ -124,8 +127,8 @@ class StepEngine(Engine):
         finally:
             self.ground_seconds += time.perf_counter() - began
 
-    def improving_maps(self) -> Iterator[Found]:
-        return self._answers(self._read, *(("opt", 0) if self._theory.priorities else ("ignore", 1)))
+    def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
+        return self._answers(self._read, *((",".join(["opt", *map(str, most)]), 0) if self._theory.priorities else ("ignore", 1)))
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         bound = ",".join(map(str, cost))

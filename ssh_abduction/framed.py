@@ -19,7 +19,7 @@ full theory is among them.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import chain, combinations
@@ -68,8 +68,10 @@ class FramedEngine(SameEngine):
 
     lists_least = True
 
-    def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
-        super().__init__(trace, theory, watch, log, speedups)
+    def __init__(
+        self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups, around: Mapping[int, Sequence[int]] | None = None
+    ) -> None:
+        super().__init__(trace, theory, watch, log, speedups, around)
         self.paths = len(trace)  # names for paths are never short
         self._guess: list[int] | None = None  # labels of a map of the causal axioms
         self._guessed = False  # whether maps near the guess were sought
@@ -97,7 +99,7 @@ class FramedEngine(SameEngine):
             self._framed = False
             self.size = size
 
-    def improving_maps(self) -> Iterator[Found]:
+    def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         if not self._framed:
             return
         best: Found | None = None
@@ -181,7 +183,7 @@ class FramedEngine(SameEngine):
 
     def map_mended_from(self, known: Sequence[int]) -> Found | None:
         """A map of the whole trace in which the first steps keep these dstates, as far as can be, and all else is new, if that has streets."""
-        chart = self._chart = Chart.framed(self._trace, self._log)
+        chart = self._chart = Chart.framed(self._trace, self._log, around=self._around)
         guess = [-1] * len(chart.seen)
         for node, label in zip(chart.node_of, known, strict=False):
             guess[node] = label
@@ -422,7 +424,7 @@ class FramedEngine(SameEngine):
 
     def _charted(self, size: int) -> FramedChart:
         """The nodes, and which of them are at different places because of what the trace alone says of order and sides."""
-        chart = Chart.framed(self._trace, self._log, size)
+        chart = Chart.framed(self._trace, self._log, size, self._around)
         nodes = range(len(chart.seen))
         control = self._streets.telling(chart, nodes, nodes)
         self._watch.check()

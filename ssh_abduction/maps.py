@@ -13,7 +13,7 @@ import os
 import re
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -63,6 +63,10 @@ class SSHMap:
     places: tuple[int, ...] = ()
     paths: tuple[Path, ...] = field(default=(), compare=False)
     excused: tuple[tuple[int, int], ...] = field(default=(), compare=False)
+
+    def without_headings(self) -> SSHMap:
+        """The same map for a theory in which places have no frames."""
+        return replace(self, dstates=tuple(replace(s, heading=None) for s in self.dstates))
 
     def to_dict(self) -> dict[str, Any]:
         """The map as plain data, as `solve --json` prints it (docs/formats.md)."""

@@ -125,7 +125,7 @@ class NamedEngine(ChartedEngine):
         """The columns of these nodes in the matrix of apart nodes, where that is too large."""
         return np.stack([apart_from(self._chart.seen, self._log.actions[: self.size - 1], t) for t in nodes], axis=1)
 
-    def improving_maps(self) -> Iterator[Found]:
+    def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         for labels in self._better_labels():
             yield self._found(labels)
 

@@ -105,7 +105,7 @@ class OnlineMapper:
         self._cost: Cost | None = None
         self._maps: list[_Replayed] = []
         self._drafts: list[Sketch] = []  # beyond maps of fewer steps, the best first
-        self._sketches = [Sketch(first, self.theory, homing) for homing in (True, False)]
+        self._sketches = Sketch.all_of(first, self.theory)
         self._guess: MapGuess | None = None
         self._next_guess = GUESSED  # not before the trace has so many steps
         self._mending = MENDING  # seconds, by the square of the number of steps

@@ -36,6 +36,8 @@ from ssh_abduction.asking import Watch, new_control
 from ssh_abduction.chart import Chart, FramedChart, numbered
 from ssh_abduction.engine import ChartedEngine
 from ssh_abduction.replay import Log
+from ssh_abduction.speedups import Speedups
+from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
 SECONDS_A_PAIR = 3e-5  # what clingo takes, about, to ground two visits that may be one: it cannot be stopped meanwhile
@@ -56,10 +58,19 @@ class TakesLong(Exception):  # noqa: N818 - not an error
 
 
 class SameEngine(ChartedEngine):
-    """Which visits are one, so that dstates are fewest."""
+    """Which visits are one, so that dstates are fewest.
+
+    around  as in Chart.framed, where steps have no stars
+    """
 
     _chart: FramedChart
     _known: tuple[int, ...] | None  # labels of a map; set by who finds one near a guess
+
+    def __init__(
+        self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups, around: Mapping[int, Sequence[int]] | None = None
+    ) -> None:
+        super().__init__(trace, theory, watch, log, speedups)
+        self._around = around
 
     def over(self, trace: Trace, watch: Watch, log: Log) -> Self:
         self._trace, self._watch, self._log = trace, watch, log
@@ -77,7 +88,7 @@ class SameEngine(ChartedEngine):
         began = time.perf_counter()
         grown = self.size > 0
         if grown:
-            chart = replace(Chart.framed(self._trace, self._log, size), elsewhere=self._chart.elsewhere)
+            chart = replace(Chart.framed(self._trace, self._log, size, self._around), elsewhere=self._chart.elsewhere)
             grown = len(chart.seen) <= GROWN * self._first_nodes
         if grown:
             order = list(range(len(self._chart.seen), len(chart.seen)))

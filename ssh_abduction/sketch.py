@@ -17,6 +17,8 @@ Where the way back looks otherwise than remembered, the travel goes to a new pla
 contradicted, the sketch is given up; one without `homing`, that never takes a place for one seen before unless next_place asks
 for it, may still do.
 
+Where the theory asks for no frames, a sketch may still have them: that adds axioms, and leaves none out.
+
 A sketch may also begin with a map of some steps, and grow like a tree beyond it. What is new then lies on new streets, or on one known street, and
 contradicts nothing either. But a turn can be the first to show how two known streets cross, which then has to fit all their places; and without frames,
 a dstate that a turn leads to itself lies on no street: whether that fits, the sketch does not say.
@@ -53,14 +55,16 @@ class _State:
 class Sketch:
     """A map of the steps so far, which grows with each.
 
+    homing   whether a travel may go back to where it came from, though next_place does not ask for it
+    framed   whether places have frames, though the theory does not ask for them: most turns then lead to what is known
     certain  whether the map is known to be consistent; if not, it is to be checked, and this to be set
     """
 
-    def __init__(self, first: Step, theory: Theory, homing: bool = True) -> None:
+    def __init__(self, first: Step, theory: Theory, homing: bool = True, framed: bool = False) -> None:
         self.labels: list[int] = []
         self._theory = theory
         self._homing = homing or theory.next_place
-        self._framed = theory.star == "frame"
+        self._framed = framed or theory.star == "frame"
         self._states: list[_State] = []
         self._links: dict[tuple[int, str], int] = {}
         self._stars: list[object] = []  # of each place
@@ -74,6 +78,12 @@ class Sketch:
         self.labels.append(self._new_place(first))
         if theory.all_on_paths and theory.level == "topological":
             self._find_course(0)
+
+    @classmethod
+    def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
+        """Sketches of a trace that begins so, those first that become smaller if they are not given up."""
+        framed = [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
+        return [cls(first, theory, homing, frames) for frames in framed for homing in (True, False)]
 
     @classmethod
     def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Sketch:
@@ -245,7 +255,7 @@ class Sketch:
 
     def _star(self, step: Step, heading: int) -> object:
         """The star of a place where this is seen: in its frame, if it has one."""
-        star = step.openings
+        star = step.openings if self._theory.star != "none" else None
         if self._framed and star is not None:
             return tuple(star[(slot - heading) % 4] for slot in range(4))
         return observation(step, self._theory)[1]
@@ -269,7 +279,7 @@ class Sketch:
                 place=s.place,
                 path=None if s.path is None else first[s.path][0],
                 direction=None if s.path is None else s.direction * first[s.path][1],
-                heading=s.heading if self._framed else None,
+                heading=s.heading if self._theory.star == "frame" else None,
             )
             for i, s in enumerate(self._states)
         )

@@ -42,12 +42,13 @@ determinism, and that a dstate has one place, course and heading. A theory `with
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from ssh_abduction import facts
-from ssh_abduction.asking import Grounding, Stop, Stopped, Watch
+from ssh_abduction.asking import Grounding, Paused, Stop, Stopped, Watch
 from ssh_abduction.certificate import RESTS_ON, Certificate, Evidence
 from ssh_abduction.engine import AT_ONCE, Engine, Found, StepEngine
 from ssh_abduction.errors import SolverError, brief
@@ -62,6 +63,9 @@ FIRST_PREFIX = 8  # steps; short enough that solving it costs next to nothing
 HELD_BACK = 1000  # maps kept until a prefix proves long enough; from there on they stream
 FIRST_PATHS = 8  # names for paths to begin with
 FEW_STEPS = 24  # of a trace or a prefix; so many are solved sooner without names, a map made greedily, or a question from below
+FRAME_AFTER = 1.0  # seconds after which a map with frames is sought, where the theory does not ask for one
+FRAMING = 20.0  # seconds that this may take, at most
+FRAMING_SHARE = 0.4  # of the time that is left, for either, if that is less
 ALL = Speedups()
 
 
@@ -253,6 +257,7 @@ class Search:
         self._begun = False
         self._apart: Evidence | None = None  # of the whole trace, where the search was stopped
         self._most = maps
+        self._memory = memory
         self._log = Log(trace, self.theory)
         self._whole = not speedups.prefixes or bool(self.theory.without)
         self._speedups = speedups
@@ -313,7 +318,7 @@ class Search:
                     self._merge()
             elif not self.prefix:
                 self._engine.grow(len(self.trace) if self._engine.lists_least else min(len(self.trace), FIRST_PREFIX))
-            if self.status is Status.OPTIMAL or self._find_cost():
+            if self.status is Status.OPTIMAL or self._find_cost_or_pause():
                 for ssh_map in self._minimal_maps():
                     if self._most and self.count == self._most:
                         self.stopped = "maps limit"
@@ -399,6 +404,42 @@ class Search:
         if self._apart:
             self.bound = replace(self.bound, dstates=max(len(self._apart.certificate.clique), self.bound.dstates or 0))
 
+    def _find_cost_or_pause(self) -> bool:
+        """The same as _find_cost; where that takes long, seek a map with frames first, and go on from there."""
+        if self._may_frame():
+            self._watch.pause_after(min(FRAME_AFTER, FRAMING_SHARE * self._watch.left()))
+            try:
+                return self._find_cost()
+            except Paused:
+                pass
+            finally:
+                self._watch.pause_after(math.inf)
+            self._frame()
+            self._start = max(self._start, self.prefix)
+        return self._find_cost()
+
+    def _may_frame(self) -> bool:
+        """Whether a map in which places have frames is worth seeking, and the trace not too long for that."""
+        known = self._speedups.framing and isinstance(self._engine, StepEngine) and self.theory.with_frames() is not None
+        return known and FEW_STEPS < len(self.trace) <= AT_ONCE
+
+    def _frame(self) -> None:
+        """Seek maps in which places have frames."""
+        from ssh_abduction.framing import maps_with_frames  # loads numpy
+
+        seconds = min(FRAMING, FRAMING_SHARE * self._watch.left())
+        beside = Watch(seconds, self._memory, self._watch.check)
+        beside.use_reserve()
+        beside.start()
+        try:
+            for found in maps_with_frames(self.trace, self.theory, beside, self._speedups):
+                cost = self._cost_of(found)
+                if self.best is None or cost < self._cost:
+                    self._keep(Found(found, cost), found.labels)
+                    self._report()
+        except Stopped:
+            self._watch.check()
+
     def _find_cost(self) -> bool:
         """Extend the prefix until a minimal map of it replays to the end. False where the prefix has no map."""
         size = min(len(self.trace), self._start)
@@ -417,6 +458,9 @@ class Search:
             replayed = self._log.replay(minimal.map.labels)
             if replayed.outcome is Outcome.PREDICTED:
                 self._keep(minimal, replayed.labels)
+                self.status = Status.OPTIMAL
+                return True
+            if self.best is not None and self._cost <= minimal.cost:  # a map of the whole trace, as cheap as any of the prefix
                 self.status = Status.OPTIMAL
                 return True
             size = self._engine.next_size(len(replayed.labels))
@@ -441,12 +485,10 @@ class Search:
         if self.best is not None:
             return
         first, *rest = self.trace.steps
-        for homing in (True, False):
-            sketch = Sketch(first, self.theory, homing)
+        for sketch in Sketch.all_of(first, self.theory):
             if all(sketch.extend(action, step) for action, step in zip(self.trace.actions, rest, strict=True)):
                 found = sketch.map()
-                cost = Cost.of(found)
-                self._keep(Found(found, tuple(getattr(cost, name) for name in self.theory.priorities)), found.labels)
+                self._keep(Found(found, self._cost_of(found)), found.labels)
                 return
 
     def _minimise(self) -> Found | None:
@@ -469,7 +511,7 @@ class Search:
         below = self._speedups.from_below and not self._whole and self.prefix > FEW_STEPS and isinstance(self._engine, StepEngine)
         if self._lower is not None and below:
             yield from itertools.islice(self._engine.maps_of_cost(self._lower, 1), 1)
-        yield from self._engine.improving_maps()
+        yield from self._engine.improving_maps(self._cost if self.best and not self._whole else ())
 
     def _name_paths(self, cost: tuple[int, ...] | None) -> bool:
         """Take a control with more names for paths, if the minimal cost found needs them. Says whether it was so."""
@@ -555,6 +597,10 @@ class Search:
         self._raise_bound(self._engine.bound)
         self._engine.settle()
         self._watch.stop()
+
+    def _cost_of(self, ssh_map: SSHMap) -> tuple[int, ...]:
+        cost = Cost.of(ssh_map)
+        return tuple(getattr(cost, name) for name in self.theory.priorities)
 
     def _best_cost(self) -> Cost | None:
         """The counts of the best map; where axioms are left out, clingo may count more places or paths than the map can show."""

@@ -221,6 +221,10 @@ class Trace:
         )
         return cls(steps, name=name)
 
+    def without_stars(self) -> Trace:
+        """The same trace, as if no openings had been seen."""
+        return replace(self, steps=tuple(replace(step, star=None) for step in self.steps))
+
     def with_views(self, views: Iterable[View]) -> Trace:
         """This trace with a view a step. Raises TraceError."""
         seen = list(views)

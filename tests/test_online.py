@@ -111,7 +111,7 @@ def test_a_star_seen_from_another_side_is_no_contradiction() -> None:
 def test_sketches_are_consistent(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=14), label="trace")
     theory = data.draw(theories(trace), label="theory").resolve(trace)
-    sketch = Sketch(trace.steps[0], theory, homing=data.draw(st.booleans(), label="homing"))
+    sketch = data.draw(st.sampled_from(Sketch.all_of(trace.steps[0], theory)), label="sketch")
     for i, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True)):
         assert check(trace.prefix(i + 1), sketch.map(), theory) == ()
         if not sketch.extend(action, step):

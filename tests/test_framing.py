@@ -1,0 +1,150 @@
+"""Theories that ask for no frames: maps in which places have frames all the same, so that a small map is known where clingo takes its time."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from unittest.mock import patch
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from instances import maze
+from strategies import theories, traces
+
+from ssh_abduction import Search, Speedups, SSHMap, Status, Theory, Trace, framing, solve, solver
+from ssh_abduction.asking import Paused, Stopped, Watch
+from ssh_abduction.checker import check
+from ssh_abduction.framing import maps_with_frames
+from ssh_abduction.sketch import Sketch
+from ssh_abduction.speedups import SPEEDUPS
+
+THEORIES = {
+    "dstates": Theory.topological(),
+    "paths": Theory.circumscriptive(),
+    "no sides": Theory(boundary="none"),
+    "excuses": Theory(boundary="defeasible"),
+    "partial order": Theory(path_order="partial"),
+}
+
+
+def started(limit: float | None = None) -> Watch:
+    watch = Watch(limit)
+    watch.start()
+    return watch
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.data())
+def test_maps_with_frames_are_maps_of_the_theory(data: st.DataObject) -> None:
+    trace = data.draw(traces(max_steps=10), label="trace")
+    theory = data.draw(theories(trace), label="theory").resolve(trace)
+    costs = []
+    for ssh_map in maps_with_frames(trace, theory, started(), Speedups()):
+        assert check(trace, ssh_map, theory) == ()
+        costs.append(len(ssh_map.dstates))
+    assert costs == sorted(costs, reverse=True)
+    if not costs or theory.prefer[:1] != ("dstates",):
+        return
+    assert costs[-1] >= len(solve(trace, theory, maps=1).maps[0].dstates)
+
+
+@settings(max_examples=70, deadline=None, derandomize=True)
+@given(st.data())
+def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
+    """Sought before anything else, so that it is known whenever a prefix has as cheap a map."""
+    trace = data.draw(traces(), label="trace")
+    theory = data.draw(theories(trace), label="theory")
+    first = data.draw(st.sampled_from([1, 3, solver.FIRST_PREFIX]), label="first prefix")
+    expected = solve(trace, theory, maps=0, speedups=Speedups.without(SPEEDUPS))
+    with patch.multiple(solver, FRAME_AFTER=-1.0, FEW_STEPS=0, FIRST_PREFIX=first):
+        found = solve(trace, theory, maps=0, speedups=Speedups.without("names"))
+    assert found.status is expected.status
+    assert found.complete
+    assert set(found.maps) == set(expected.maps)
+    assert found.count == len(set(found.maps))
+    if found.cost and expected.cost:
+        priorities = found.theory.priorities
+        assert [getattr(found.cost, name) for name in priorities] == [getattr(expected.cost, name) for name in priorities]
+
+
+@pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
+def test_a_maze_without_stars_has_a_small_map_before_the_proof(theory: Theory) -> None:
+    """In the second part of its search it is interrupted at once; the robot was in 32 dstates."""
+    walk = maze(3, 3, steps=400, seed=0)
+    with patch.object(Search, "_find_cost", side_effect=[Paused, KeyboardInterrupt]):
+        solution = solve(walk.trace, theory)
+    assert (solution.status, solution.stopped, solution.count) == (Status.FEASIBLE, "interrupted", 1)
+    assert solution.cost
+    assert solution.cost.dstates <= len(set(walk.truth)) == 32
+    assert check(walk.trace, solution.maps[0], solution.theory) == ()
+
+
+def test_a_maze_of_loops_has_a_map_smaller_than_a_sketch() -> None:
+    trace = maze(3, 3, steps=400, seed=1, loops=0.5).trace
+    sketched = solve(trace, limit=1e-9)
+    with patch.object(Search, "_find_cost", side_effect=[Paused, KeyboardInterrupt]):
+        found = solve(trace)
+    assert found.cost
+    assert sketched.cost
+    assert found.cost.dstates <= 36 < sketched.cost.dstates
+
+
+def test_listing_is_not_paused() -> None:
+    """Where the cost is found before it is time for frames."""
+    trace = maze(2, 2, steps=30, seed=0).trace
+    listed = Search._minimal_maps
+
+    def slowly(self: Search) -> Iterator[SSHMap]:
+        self._watch._spent += 2 * solver.FRAME_AFTER
+        yield from listed(self)
+
+    with patch.object(Search, "_minimal_maps", slowly):
+        solution = solve(trace, maps=0)
+    assert solution.complete
+    assert set(solution.maps) == set(solve(trace, maps=0, speedups=Speedups.without("framing")).maps)
+
+
+@pytest.mark.parametrize("theory", [Theory.topological(), Theory(next_place=True), Theory(all_on_paths=True)], ids=["", "next", "on paths"])
+def test_a_sketch_with_frames_is_smaller(theory: Theory) -> None:
+    trace = maze(3, 3, steps=400, seed=0).trace
+    first, *rest = trace.steps
+    sizes = []
+    for sketch in Sketch.all_of(first, theory.resolve(trace)):
+        assert all(sketch.extend(action, step) for action, step in zip(trace.actions, rest, strict=True))
+        assert check(trace, sketch.map(), theory.resolve(trace)) == ()
+        sizes.append(len(sketch.map().dstates))
+    framed, homing, *_ = sizes[0], sizes[2]
+    assert framed < homing / 2
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt(), Stopped("time limit"), Stopped("interrupted")], ids=["ctrl-c", "limit", "interrupt"])
+def test_what_ends_it_leaves_its_last_map_and_no_thread(stop: BaseException) -> None:
+    """Its own limit ends it alone; Ctrl-C the whole search."""
+    walk = maze(3, 3, steps=120, seed=0)
+    before = set(threading.enumerate())
+    search = Search(walk.trace, limit=60)
+    found = framing.maps_with_frames
+
+    def stopped(trace: Trace, theory: Theory, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
+        yield next(found(trace, theory, watch, speedups))
+        if str(stop) == "interrupted":
+            search.interrupt()
+        raise stop
+
+    with (
+        patch.object(framing, "maps_with_frames", stopped),
+        patch.object(Search, "_find_cost", side_effect=[Paused, Stopped("memory limit")]),
+    ):
+        maps = tuple(search)
+    assert search.stopped == ("memory limit" if str(stop) == "time limit" else "interrupted")
+    assert [len(ssh_map.dstates) for ssh_map in maps] == [27]
+    assert set(threading.enumerate()) <= before
+
+
+def test_a_pause_comes_once() -> None:
+    watch = started(60)
+    watch.pause_after(-1)
+    with pytest.raises(Paused):
+        watch.check()
+    watch.check()
