@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import clingo
 
@@ -128,6 +128,9 @@ class StepEngine(Engine):
             self.ground_seconds += time.perf_counter() - began
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
+        if most:
+            configuration: Any = self._control.configuration
+            configuration.solver.opt_strategy = "usc"  # as a good map is known, what is missing is a bound
         return self._answers(self._read, *((",".join(["opt", *map(str, most)]), 0) if self._theory.priorities else ("ignore", 1)))
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
