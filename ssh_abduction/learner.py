@@ -52,6 +52,9 @@ class BootstrapLearner:
         self.choose = choose
         self.limit = limit
 
+    def __repr__(self) -> str:
+        return f"BootstrapLearner(theory={self.theory!r}, clusterer={self.clusterer!r}, choose={self.choose}, limit={self.limit})"
+
     def fit(self, trace: Trace) -> BootstrapLearner:
         """Run the loop. Raises LearnerError, PerceptionError, TraceError."""
         images = images_of(trace)
@@ -65,7 +68,9 @@ class BootstrapLearner:
         return self
 
     def predict(self, images: ArrayLike) -> NDArray[np.intp]:
-        """The dstates, ids of `map_`, at which images (m, d) were taken."""
+        """The dstates, ids of `map_`, at which images (m, d) were taken. Raises LearnerError before `fit`."""
+        if not hasattr(self, "recogniser_"):
+            raise LearnerError("learner: expected one that has learnt, got a new one; call fit with a trace first")
         return np.asarray(self.recogniser_.predict(images), np.intp)
 
 

@@ -208,6 +208,9 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     except OSError as error:
         raise MapError(f"{source}: expected a readable file of maps: {error.strerror or error}; check the path") from None
     except json.JSONDecodeError as error:
+        if error.msg == "Extra data":
+            mend = "solve prints a line for each of several traces: take one of them"
+            raise MapError(f"{source}:{error.lineno}: expected one JSON value, got more after it; {mend}") from None
         raise MapError(
             f"{source}:{error.lineno}: expected JSON, got broken JSON at column {error.colno} ({error.msg}); write it with solve --json"
         ) from None

@@ -115,6 +115,10 @@ class OnlineMapper:
         self._ask()
         self.solution = self._answer(began)
 
+    def __repr__(self) -> str:
+        cost = self.solution.cost
+        return f"<OnlineMapper: {len(self._steps)} steps, {self.solution.status.value}, {cost.dstates if cost else 'no'} dstates>"
+
     @property
     def trace(self) -> Trace:
         """The steps so far."""

@@ -51,7 +51,7 @@ from ssh_abduction import facts
 from ssh_abduction.asking import Grounding, Paused, Stop, Stopped, Watch
 from ssh_abduction.certificate import RESTS_ON, Certificate, Evidence
 from ssh_abduction.engine import AT_ONCE, Engine, Found, StepEngine
-from ssh_abduction.errors import SolverError, brief
+from ssh_abduction.errors import SolverError, TheoryError, TraceError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.replay import Log, Outcome
 from ssh_abduction.sketch import Sketch
@@ -235,7 +235,13 @@ class Search:
         after: Search | None = None,
         minimal: SSHMap | None = None,
     ) -> None:
-        for name, value in (("limit (--time-limit)", limit), ("maps (--maps)", maps), ("memory (--memory-limit)", memory)):
+        if not isinstance(trace, Trace):
+            raise TraceError(f"trace: expected a Trace, got {brief(trace)}; make one with Trace.load or Trace.from_steps")
+        if not isinstance(theory, Theory | None):
+            raise TheoryError(f"theory: expected a Theory, got {brief(theory)}; take Theory.topological(), Theory.causal() or Theory(…)")
+        if isinstance(maps, bool) or not isinstance(maps, int):
+            raise SolverError(f"maps (--maps): expected a whole number, 0 for all, got {brief(maps)}")
+        for name, value in (("limit (--time-limit)", limit), ("memory (--memory-limit)", memory)):
             if isinstance(value, bool) or not isinstance(value, int | float | None):
                 raise SolverError(f"{name}: expected a number, got {brief(value)}")
         if limit is not None and not limit > 0:

@@ -81,7 +81,7 @@ class Theory:
         value = getattr(self, field)
         if not isinstance(value, str | list | tuple):
             raise TheoryError(f"{field}: expected a list of names, got {brief(value)}")
-        names = tuple(value.split(",")) if isinstance(value, str) else tuple(value)
+        names = tuple(name.strip() for name in value.split(",")) if isinstance(value, str) else tuple(value)
         known = list(allowed)
         for i, name in enumerate(names):
             if name not in known:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+import operator
 import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -420,6 +421,8 @@ def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> 
 
 
 def _view(value: Any, where: str) -> View:
+    if not isinstance(value, bool | str) and hasattr(value, "__index__"):
+        value = operator.index(value)  # such as numpy's
     if isinstance(value, bool) or not isinstance(value, str | int):
         raise TraceError(f"{where}: expected a text or an integer, got {brief(value)}; name the view")
     if isinstance(value, int) and not -(2**31) < value < 2**31:

@@ -378,3 +378,61 @@ def test_progress_shows_on_a_terminal(tmp_path: Path) -> None:
     text = shown.decode()
     for part in ("prefix ", "of 1501 steps", "best", "dstates ≥", " s"):
         assert part in text
+
+
+def test_what_programs_read_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
+    """Else views could not be told apart."""
+    path = saved(Trace.from_steps(["日本", "中国", "Küche"], ["travel", "travel"]), tmp_path)
+    environment = {**os.environ, "PYTHONIOENCODING": "cp1252"}
+
+    def printed(*words: str, given: bytes = b"") -> str:
+        command = [sys.executable, "-m", "ssh_abduction", *words]
+        return subprocess.run(command, input=given, env=environment, capture_output=True, check=True).stdout.decode("utf-8")
+
+    maps = printed("solve", path, "--json")
+    assert [s["view"] for s in json.loads(maps)["maps"][0]["dstates"]] == ["日本", "中国", "Küche"]
+    assert 'view(1,"中国").' in printed("facts", path)
+    for form in ("--svg", "--graphml"):
+        ET.fromstring(printed("show", "-", form, given=maps.encode()))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["simulate", "notched-rectangle", "--seed", "-1", "-o", "x"], "--seed: expected a number from 0 to"),
+        (["evaluate", "x", "y", "--seed", "1e3"], "--seed: expected a number from 0 to"),
+        (["cluster", "x", "-o", "y", "--plot", "z.foo"], "--plot: expected a name that ends in .png, .pdf or .svg"),
+    ],
+)
+def test_wrong_usage(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(words)
+    assert message in capsys.readouterr().err
+
+
+def test_errors_say_what_mends_them(tmp_path: Path, capsys: pytest.CaptureFixture[str], solved: Path) -> None:
+    many, none, taken = tmp_path / "many.jsonl", tmp_path / "none.json", tmp_path / "taken"
+    many.write_text("{}\n{}\n")
+    none.write_text('{"maps": []}')
+    taken.touch()
+    for words, message in [
+        (["show", str(many)], "many.jsonl:2: expected one JSON value, got more after it; solve prints a line for each of several traces"),
+        (["show", str(none), "--svg"], "maps: expected one to draw, got none"),
+        (["show", str(none), "--map", "1"], "--map: expected a map, got none"),
+        (["train", ACES, str(solved), "--map", "5", "-o", "x"], "--map: expected 1 to 4, got 5"),
+        (["reproduce", "notched-rectangle", "--jobs", "0"], "--jobs: expected how many processes"),
+        (["reproduce", "notched-rectangle", "--seeds", "0", "--jobs", "1", "-o", str(taken)], "File exists; take another name"),
+    ]:
+        assert main(words) == 1, words
+        err = capsys.readouterr().err
+        assert message in err
+        assert err.count("\n") == 1
+
+
+def test_a_closed_standard_error_is_no_error() -> None:
+    """What would be said there is not said; what was asked for is."""
+    shell = f"{sys.executable} -m ssh_abduction solve {ACES} 2>&-; {sys.executable} -m ssh_abduction solve nosuch 2>&-"
+    done = subprocess.run(shell, shell=True, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stdout.startswith("optimal: 19 dstates")
+    assert "nosuch" not in done.stdout

@@ -59,6 +59,12 @@ def test_the_hall_is_learnt_with_the_openings_seen(hall: Trace) -> None:
     assert one_to_one(learner.labels_, true_dstates(hall))
 
 
+def test_who_has_not_learnt_recognises_nothing() -> None:
+    assert repr(BootstrapLearner(choose=1)) == "BootstrapLearner(theory=None, clusterer=None, choose=1, limit=None)"
+    with pytest.raises(LearnerError, match="call fit with a trace first"):
+        BootstrapLearner().predict([[1.0, 2.0]])
+
+
 def test_the_loop_fits_on_one_screen() -> None:
     assert len(inspect.getsource(learner_module).splitlines()) < 110
     assert len(inspect.getsource(BootstrapLearner.fit).splitlines()) < 15

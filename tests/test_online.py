@@ -106,6 +106,12 @@ def test_a_star_seen_from_another_side_is_no_contradiction() -> None:
     assert mapper.searches == 2
 
 
+def test_a_mapper_says_how_far_it_is() -> None:
+    mapper = OnlineMapper("a")
+    mapper.observe("travel", "b")
+    assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
+
+
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(st.data())
 def test_sketches_are_consistent(data: st.DataObject) -> None:

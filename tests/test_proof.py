@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from test_solver import wandering
 from test_speedups import machines
+from worlds import rectangle
 
 from ssh_abduction import MapError, OnlineMapper, Search, Theory, Trace, solve
 from ssh_abduction.apart import apartness, clique
@@ -180,3 +181,25 @@ def test_check_bound_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
     assert "certificate: expected one beside the maps" in capsys.readouterr().err
     assert main(["check", "--bound", "--without", "deterministic", str(trace), str(maps)]) == 1
     assert "which the proof rests on" in capsys.readouterr().err
+
+
+def test_a_verdict_on_another_theory_or_trace_is_not_believed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without sides the rectangle has four dstates; what clingo said of a theory with sides does not count there."""
+    trace, maps = tmp_path / "trace.jsonl", tmp_path / "maps.json"
+    rectangle(400).save(trace)
+    assert main(["solve", str(trace), "--json"]) == 0
+    maps.write_text(capsys.readouterr().out)
+    assert main(["check", "--bound", "--prefer", "dstates", str(trace), str(maps)]) == 0
+    assert "the maps have 8: no map has fewer" in capsys.readouterr().out
+    assert main(["check", "--bound", "--boundary", "none", str(trace), str(maps)]) == 0
+    shown = capsys.readouterr().out
+    assert "clingo's verdict on 4 dstates and more is left out: the file is of another theory" in shown
+    assert "the maps have 8, 4 more than proven" in shown
+    data = json.loads(maps.read_text())
+    del data["theory"]
+    maps.write_text(json.dumps(data))
+    assert main(["check", "--bound", str(trace), str(maps)]) == 0
+    assert "left out: the file does not say of which theory" in capsys.readouterr().out
+    rectangle(400, turn="L").save(trace)
+    assert main(["check", "--bound", str(trace), str(maps)]) == 20
+    assert "no map has fewer" not in capsys.readouterr().out

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -25,6 +26,7 @@ import ssh_abduction.engine as engine_module
 import ssh_abduction.solver as solver_module
 from ssh_abduction import Progress, Search, SolverError, Speedups, SSHMap, Status, Theory, TheoryError, Trace, TraceError, solve
 from ssh_abduction.checker import check
+from ssh_abduction.errors import SSHError
 from ssh_abduction.explain import Interrupted, explain
 from ssh_abduction.facts import links_of
 from ssh_abduction.replay import Log, Outcome
@@ -94,6 +96,24 @@ def test_streaming_lists_no_map_twice_and_misses_none(seed: int, monkeypatch: py
     streamed = solve(trace, Theory.causal(), maps=0)
     assert streamed.count == len(set(streamed.maps))
     assert set(streamed.maps) == set(at_once.maps)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([1, 2],), "trace: expected a Trace, got"),
+        ((rectangle(8), "causal"), "theory: expected a Theory, got 'causal'"),
+    ],
+)
+def test_arguments_of_another_kind(arguments: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(SSHError, match=re.escape(message)):
+        solve(*arguments)
+
+
+@pytest.mark.parametrize("maps", [None, 1.5, True])
+def test_a_number_of_maps_is_whole(maps: Any) -> None:
+    with pytest.raises(SolverError, match="maps"):
+        solve(rectangle(8), maps=maps)
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -199,6 +200,15 @@ def test_saving_to_nowhere(tmp_path: Path) -> None:
 def test_bad_steps(views: list[str], actions: list[str], message: str) -> None:
     with pytest.raises(TraceError, match=message):
         Trace.from_steps(views, actions)
+
+
+def test_views_may_be_numbers_of_numpy() -> None:
+    """As clusterings give them."""
+    trace = Trace.from_steps(np.array([3, 0, 3]), ["travel", "travel"])
+    assert trace == Trace.from_steps([3, 0, 3], ["travel", "travel"])
+    assert all(type(step.view) is int for step in trace)
+    with pytest.raises(TraceError, match="expected a text or an integer"):
+        Trace.from_steps(np.array([True, False]), ["travel"])
 
 
 def test_a_prefix_ends_without_an_action() -> None:

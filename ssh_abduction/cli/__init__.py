@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import io
 import os
 import sys
@@ -20,6 +21,15 @@ from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.errors import SSHError
 
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
+MENDS = {
+    errno.ENOSPC: "make room",
+    errno.ENOENT: "make the folder first",
+    errno.EACCES: "take a place that you may write to",
+    errno.EEXIST: "take another name",
+    errno.EISDIR: "take another name",
+    errno.ENOTDIR: "take another name",
+}
+FOR_PROGRAMS = ("json", "facts", "dot", "graphml", "svg")  # forms that other programs read, in UTF-8 wherever they are printed
 
 
 def parser() -> argparse.ArgumentParser:
@@ -39,10 +49,14 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - for as long as the program runs
     options = parser().parse_args(arguments)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that knows no "→" shows "?"
+    if isinstance(sys.stdout, io.TextIOWrapper) and any(getattr(options, form, False) for form in FOR_PROGRAMS):
+        sys.stdout.reconfigure(encoding="utf-8", errors="backslashreplace")  # what is left is half a character, which JSON writes so
     try:
         if sys.stdout is None:
             raise SSHError("standard output: expected a place to print to, got a closed stream; open it, or send it to a file")
@@ -63,7 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        print(f"ssh-abduction: {error.filename or 'output'}: cannot be written: {error.strerror or error}; make room", file=sys.stderr)
+        mend = MENDS.get(error.errno or 0, "check the path")
+        print(f"ssh-abduction: {error.filename or 'output'}: cannot be written: {error.strerror or error}; {mend}", file=sys.stderr)
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_ERROR

@@ -32,7 +32,8 @@ def run(options: argparse.Namespace) -> int:
     trace = Trace.load(options.trace)
     data = read_json(options.maps)
     found = data.get("theory") if isinstance(data, dict) else None
-    theory = theory_of(options, None if found is None else Theory.from_dict(found))
+    solved = None if found is None else Theory.from_dict(found)
+    theory = theory_of(options, solved)
     maps = maps_of(data, str(options.maps))
     broken = 0
     for i, ssh_map in enumerate(maps):
@@ -42,12 +43,24 @@ def run(options: argparse.Namespace) -> int:
             steps = f"{'step' if len(v.steps) == 1 else 'steps'} {', '.join(map(str, v.steps))}: " if v.steps else ""
             print(f"map {i + 1}: {v.axiom}: {steps}{v.message}")
     print(f"{len(maps) - broken} of {len(maps)} maps satisfy the {len(theory.resolve(trace).axioms)} axioms")
-    proven = not options.bound or _bound(trace, data, theory, min((len(m.dstates) for m in maps), default=None))
+    if not options.bound:
+        return EXIT_VIOLATED if broken else 0
+    doubt = None
+    if broken:
+        doubt = "some maps break axioms"
+    elif solved is None:
+        doubt = "the file does not say of which theory"
+    elif theory.resolve(trace).replace(prefer=()) != solved.resolve(trace).replace(prefer=()):
+        doubt = "the file is of another theory"
+    proven = _bound(trace, data, theory, min((len(m.dstates) for m in maps), default=None), doubt)
     return EXIT_VIOLATED if broken or not proven else 0
 
 
-def _bound(trace: Trace, data: Any, theory: Theory, fewest: int | None) -> bool:
-    """Print what the certificate of the file proves. Says whether it holds."""
+def _bound(trace: Trace, data: Any, theory: Theory, fewest: int | None, doubt: str | None) -> bool:
+    """Print what the certificate of the file proves. Says whether it holds.
+
+    doubt  why clingo's verdict cannot be taken for one on this trace and theory, if so
+    """
     if RESTS_ON - set(theory.axioms):
         raise MapError("bound: expected a theory with the axioms functional_view and deterministic, which the proof rests on")
     if not isinstance(data, dict) or "certificate" not in data:
@@ -59,8 +72,10 @@ def _bound(trace: Trace, data: Any, theory: Theory, fewest: int | None) -> bool:
         return False
     pairs = bound.dstates * (bound.dstates - 1) // 2
     print(f"at least {bound.dstates} dstates: as many steps, of which no two can be one dstate ({pairs} pairs checked)")
-    total = bound.dstates + len(bound.refuted)
-    if bound.refuted:
+    total = bound.dstates + (0 if doubt else len(bound.refuted))
+    if bound.refuted and doubt:
+        print(f"clingo's verdict on {bound.refuted[0]} dstates and more is left out: {doubt}")
+    elif bound.refuted:
         sizes = f"{bound.refuted[0]} to {total - 1}" if len(bound.refuted) > 1 else str(bound.refuted[0])
         print(f"at least {total} dstates, if clingo is right that there is no map of {sizes}")
     if fewest is not None:

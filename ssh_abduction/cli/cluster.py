@@ -8,7 +8,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.options import Verbs, picture_file, seed
 from ssh_abduction.cli.text import table
 from ssh_abduction.errors import SSHError
 from ssh_abduction.trace import Trace
@@ -21,8 +21,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="TRACE", help="trace file to write")
     parser.add_argument("--k", type=int, help="number of views (default: the one with the largest M)")
     parser.add_argument("--k-max", type=int, metavar="K", help="largest number of views to try (default: 20)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of k-means (default: 0)")
-    parser.add_argument("--plot", metavar="PNG", help="draw M, and U where the truth is known, against k")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of k-means (default: 0)")
+    parser.add_argument("--plot", type=picture_file, metavar="PNG", help="draw M, and U where the truth is known, against k")
     parser.set_defaults(run=run)
 
 

@@ -14,7 +14,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser("facts", help="print a trace as .lp facts", description=text)
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     add_theory(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, facts=True)
 
 
 def run(options: argparse.Namespace) -> int:

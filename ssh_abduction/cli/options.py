@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
+from ssh_abduction.errors import MapError
 from ssh_abduction.theory import CHOICES, COUNTS, PRESETS, Theory
 
 Verbs = Any  # argparse's type for what add_subparsers returns is private
@@ -25,6 +28,26 @@ def add_theory(parser: argparse.ArgumentParser, default: str = "topological, or 
         group.add_argument(f"--{name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=text)
     group.add_argument("--prefer", metavar="COUNTS", help=f"what to minimise, first to last, of {', '.join(COUNTS)}; commas between")
     group.add_argument("--without", metavar="AXIOMS", help="leave these axioms out; commas between")
+
+
+def seed(text: str) -> int:
+    """A seed of random numbers."""
+    if not text.isdecimal() or int(text) >= 2**32:
+        raise argparse.ArgumentTypeError(f"expected a number from 0 to {2**32 - 1}, got {text!r}")
+    return int(text)
+
+
+def picture_file(text: str) -> str:
+    """A file that a figure can be drawn into."""
+    if Path(text).suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise argparse.ArgumentTypeError(f"expected a name that ends in .png, .pdf or .svg, got {text!r}")
+    return text
+
+
+def check_number(number: int | None, maps: Sequence[object], where: str) -> None:
+    """Whether there is such a map, counted from 1. Raises MapError."""
+    if number is not None and not 1 <= number <= len(maps):
+        raise MapError(f"{where}: --map: expected 1 to {len(maps)}, got {number}" if maps else f"{where}: --map: expected a map, got none")
 
 
 def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theory:

@@ -31,6 +31,8 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.reproduce.report import reproduce, spread_of, steps
 
     seeds = _seeds(options.seeds)
+    if options.jobs == 0:
+        raise SSHError("--jobs: expected how many processes, or -1 for one a core, got 0; leave it out for 2")
     folder = Path(options.output or f"out/{options.experiment}")
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as progress:

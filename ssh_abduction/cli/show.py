@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.options import Verbs, check_number
 from ssh_abduction.cli.text import describe
 from ssh_abduction.errors import MapError
 from ssh_abduction.maps import maps_of, read_json
@@ -24,9 +24,10 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     maps = maps_of(read_json(options.maps), str(options.maps))
-    if options.map is not None and not 1 <= options.map <= len(maps):
-        raise MapError(f"{options.maps}: --map: expected 1 to {len(maps)}, got {options.map}")
+    check_number(options.map, maps, options.maps)
     if not maps:
+        if options.dot or options.graphml or options.svg:
+            raise MapError(f"{options.maps}: maps: expected one to draw, got none; see the status that solve printed")
         print("no map")
         return 0
     chosen = maps[(options.map or 1) - 1]

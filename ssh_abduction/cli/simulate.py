@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.options import Verbs, seed
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -12,7 +12,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
     parser.add_argument("world", help="notched-rectangle, taylor-hall, a world file (.json), or an occupancy map (.yaml)")
     parser.add_argument("--tours", type=int, default=1, metavar="N", help="how often the route is driven (default: 1)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of all noise (default: 0)")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of all noise (default: 0)")
     parser.add_argument("--no-stars", action="store_true", help="do not log the openings that the robot sees at each place")
     parser.add_argument("--every", type=float, metavar="M", help="log an image each so many metres, rather than at dstates")
     parser.add_argument("--start", metavar="X,Y,DEGREES", help="another start than the world's; write --start=-1,2,90")

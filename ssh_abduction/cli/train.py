@@ -6,7 +6,7 @@ import argparse
 import json
 from typing import Any
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.options import Verbs, check_number, picture_file, seed
 from ssh_abduction.cli.text import table
 from ssh_abduction.errors import MapError
 from ssh_abduction.maps import maps_of, read_json
@@ -21,8 +21,8 @@ def add_parser(verbs: Verbs) -> None:
     text = "Recognition rate by 10-fold cross-validation, against the number of images, on the labels that a map gives."
     evaluate = verbs.add_parser("evaluate", help="learning curve of a recogniser", description=text)
     evaluate.add_argument("--folds", type=int, default=10, help="parts of the cross-validation (default: 10)")
-    evaluate.add_argument("--seed", type=int, default=0, help="seed of the folds (default: 0)")
-    evaluate.add_argument("--plot", metavar="PNG", help="draw the learning curve")
+    evaluate.add_argument("--seed", type=seed, default=0, help="seed of the folds (default: 0)")
+    evaluate.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the learning curve")
     evaluate.add_argument("--json", action="store_true", help="print JSON")
     evaluate.set_defaults(run=run_evaluate)
     for parser in (train, evaluate):
@@ -44,8 +44,10 @@ def _labelled(options: argparse.Namespace) -> tuple[Any, Any]:
 
     trace = Trace.load(options.trace)
     data = read_json(options.maps)
+    maps = maps_of(data, str(options.maps))
+    check_number(options.map, maps, options.maps)
     labels = labels_of(
-        maps_of(data, str(options.maps)),
+        maps,
         None if options.map is None else options.map - 1,
         bool(data.get("complete", True)) if isinstance(data, dict) else True,
     )
