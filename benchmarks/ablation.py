@@ -16,18 +16,18 @@ from pathlib import Path
 from typing import Any
 
 from bench import machine, packages, run, store
-from suite import INSTANCES, SMALL, Instance
+from suite import BARE, INSTANCES, SMALL, Instance
 from table import OURS, WITHOUT, times
 
 from ssh_abduction.speedups import SPEEDUPS
 
 CAUSAL = ["rectangle n=400", "rectangle n=40000", "moore 8/2 n=800", "moore 30/10 n=200", "moore 100/10 n=3200"]
 CAUSAL += ["maze 2x2 n=1600", "maze 3x3 n=1600", "maze 4x4 n=1600"]
-FULL = ["full rectangle n=400", "full aces3"]
+FULL = ["full rectangle n=400", "full aces3", BARE.name]
 FRAMED = ["full taylor-hall", SMALL.name, "full maze 5x5 n=1600", "full maze 10x10 n=200"]
 USED = {
     "causal": {"prefixes", "names", "clique", "apart", "lazy", "core_guided", "annealed", "watched", "one_by_one", "threads", "greedy"},
-    "full": {"prefixes", "path_names", "from_below"},
+    "full": {"prefixes", "path_names", "from_below", "framing"},
     "framed": {"prefixes", "names", "clique", "core_guided", "small_cores", "sides", "annealed", "watched", "threads"},
 }
 

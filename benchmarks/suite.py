@@ -92,4 +92,5 @@ SUITE = {
     )
 }
 SMALL = _maze(2, 60, full=True)  # what the full theory's plain encoding can still do: for ablation.py
-INSTANCES = {**SUITE, SMALL.name: SMALL}
+BARE = Instance("full maze 3x3 n=400, no stars", lambda seed: maze(3, 3, steps=400, seed=seed))  # where a map with frames is sought
+INSTANCES = {**SUITE, SMALL.name: SMALL, BARE.name: BARE}

@@ -176,6 +176,13 @@ class FramedChart(Chart):
         steps = zip(pairwise(self.node_of), trace.actions, strict=False)
         return list(dict.fromkeys((s, action.turn, x) for (s, x), action in steps if action.turn))
 
+    @property
+    def fitting(self) -> int:
+        """How many pairs of visits `fits` has, which may be too many to list."""
+        import numpy as np
+
+        return int(np.count_nonzero(np.triu(~self.misfits, 1)))
+
     def fits(self) -> list[tuple[int, int, int]]:
         """Visits I < J that may be at one place, and R, where slot 0 of I is then slot R of J."""
         import numpy as np

@@ -177,7 +177,7 @@ class FramedEngine(SameEngine):
             self._chart = self._charted(len(self._trace))
         except NoFrame:
             return None
-        if len(self._chart.fits()) > GUESSABLE:
+        if self._chart.fitting > GUESSABLE:
             return None
         return self._single_streets(self._streets.guessed_labels(self._chart, self._watch.check))
 

@@ -98,8 +98,8 @@ class SameEngine(ChartedEngine):
             self._watch.check()
             self.clique = clique(apart, chart.seen) if self._speedups.clique else []
             order = [*self.clique, *sorted(set(range(len(apart))) - set(self.clique), key=lambda node: (-int(apart[node].sum()), node))]
+        self._watch.check(SECONDS_A_PAIR * (chart.fitting - (len(self._fits) if grown else 0)))
         fits = frozenset(chart.fits())
-        self._watch.check(SECONDS_A_PAIR * len(fits - self._fits if grown else fits))
         self.size = 0  # until clingo was told all of it
         if not grown:
             self._begin(chart, fits)

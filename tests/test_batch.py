@@ -11,8 +11,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -174,7 +175,7 @@ def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -
 def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler: str) -> None:
     deadly = Deadly(*(getattr(QUESTION, name) for name in Question.__slots__))
     paths = [f"{name}.jsonl" for name in ("quick", "deadly", "comb", "quick")]
-    for answers in (batch._here(deadly, paths, 2), batch._on_cluster(deadly, paths, scheduler, None)):
+    for answers in (batch._here(deadly, paths, 2, threading.Event()), batch._on_cluster(deadly, paths, scheduler, None)):
         lines = {answer.number: answer.line for answer in answers}
         assert sorted(lines) == [*range(len(paths))]
         for number, path in enumerate(paths):
@@ -216,23 +217,24 @@ def test_ctrl_c_prints_what_waited_for_its_turn(traces: Path, monkeypatch: pytes
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
-@pytest.mark.parametrize("jobs", ["1", "2"])
-def test_ctrl_c_ends_the_processes(jobs: str, traces: Path) -> None:
+@pytest.mark.parametrize(("jobs", "send"), [("1", os.killpg), ("2", os.killpg), ("2", os.kill)], ids=["1", "2", "2, from another program"])
+def test_ctrl_c_ends_the_processes(jobs: str, send: Callable[[int, int], None], traces: Path) -> None:
+    """What was found of the traces under way is printed, whether all processes hear of it, as from a terminal, or the first one alone."""
     paths = ["quick.jsonl", "slow.jsonl", "quick.jsonl", "slow.jsonl", "slow.jsonl"]
     command = [sys.executable, "-m", "ssh_abduction", "solve", *paths, *ENDLESS, "--jobs", jobs]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         assert process.stdout is not None
         first = process.stdout.readline()
         time.sleep(0.5)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        send(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=30)
     assert process.returncode == 130
     lines = [first, *out.splitlines()]
     assert first.startswith("quick.jsonl: optimal")
     unfinished = len(paths) - sum("(interrupted)" not in line for line in lines)
     assert err == f"ssh-abduction: interrupted: {unfinished} of 5 traces not finished\n"
+    assert re.match(r"slow.jsonl: \w+.*\(interrupted\)", lines[1])
     if jobs == "1":
-        assert re.match(r"slow.jsonl: \w+.*\(interrupted\)", lines[1])
         assert unfinished == 4
     deadline = time.monotonic() + 20
     with contextlib.suppress(ProcessLookupError):

@@ -286,6 +286,17 @@ def test_apart_nodes_are_different_dstates_of_the_world() -> None:
         assert not any(truth[i][:2] == truth[j][:2] for i, j in chart.elsewhere)
 
 
+def test_pairs_that_are_too_many_are_not_listed() -> None:
+    """They are counted first: ten million would take gigabytes."""
+    trace = maze(3, 3, steps=120, seed=1, stars=True).trace
+    chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
+    assert chart.fitting == len(chart.fits()) > 50
+    with patch.object(same, "SECONDS_A_PAIR", 1000.0), patch.object(FramedChart, "fits", side_effect=AssertionError):
+        solution = solve(trace, limit=30)
+    assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
+    assert check(trace, solution.maps[0], solution.theory) == ()
+
+
 def test_nodes_that_one_frame_fits_are_not_apart() -> None:
     """A node for a visit and a way of facing, linked by rotations both ways and by travels."""
     star = [(0, 0, 1, 0), (1, 0, 0, 0), (1, 0, 1, 0), (1, 0, 1, 0)]

@@ -10,8 +10,11 @@ import contextlib
 import ctypes
 import gc
 import logging
+import os
 import re
+import signal
 import sys
+import tempfile
 import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -106,14 +109,14 @@ def run(options: argparse.Namespace) -> int:
     if options.scheduler or options.jobs not in (None, 1):
         speedups = replace(speedups, threads=False)  # the processors have other traces to solve
     question = Question(theory_of(options), options.time_limit, options.maps, options.memory_limit, speedups, options.json)
+    stop = threading.Event()
     if options.scheduler is None:
-        answers = _here(question, paths, options.jobs or 1)
+        answers = _here(question, paths, options.jobs or 1, stop)
     else:
         answers = _on_cluster(question, paths, options.scheduler, options.jobs)
     lines: dict[int, str] = {}  # of answers whose turn has not come
     codes: list[int] = []
     turn = 0
-    stop = threading.Event()
     with _progress(len(paths)) as (say, advance), contextlib.closing(answers):
         try:
             for answer in answers:
@@ -124,8 +127,10 @@ def run(options: argparse.Namespace) -> int:
                     while turn in lines:
                         say(lines.pop(turn))
                         turn += 1
-                if stop.is_set() or answer.code == EXIT_INTERRUPTED:
-                    raise KeyboardInterrupt
+                if answer.code == EXIT_INTERRUPTED:
+                    stop.set()
+            if stop.is_set():
+                raise KeyboardInterrupt
         except KeyboardInterrupt:
             stop.set()
             for number in sorted(lines):
@@ -140,18 +145,30 @@ def run(options: argparse.Namespace) -> int:
     return max(codes)
 
 
-def _here(question: Question, paths: Sequence[str], jobs: int) -> Generator[Answer]:
-    """Answers from processes of this machine; with one job, from this process."""
+def _here(question: Question, paths: Sequence[str], jobs: int, stop: threading.Event) -> Generator[Answer]:
+    """Answers from processes of this machine; with one job, from this process. Once it is to stop, those of traces under way, as far as these are."""
     from joblib import effective_n_jobs
     from joblib.externals.loky import get_reusable_executor
 
     warnings.filterwarnings("ignore", module="joblib")  # about processes that ended early: the answers say it better
     processes = min(effective_n_jobs(jobs), len(paths))
-    try:
-        yield from _answers(question, paths, partial(_in_processes, question, processes))
-    finally:
-        if processes > 1:
-            get_reusable_executor().shutdown()  # else joblib keeps them, in this folder, for whoever calls next
+    if processes == 1:
+        yield from _answers(question, paths, partial(_in_processes, question, 1, stop, None))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        stopped = Path(folder) / "stopped"
+
+        def end() -> None:
+            if stop.is_set():  # Ctrl-C once more
+                raise KeyboardInterrupt
+            stop.set()
+            stopped.touch()
+
+        try:
+            with on_ctrl_c(end):
+                yield from _answers(question, paths, partial(_in_processes, question, processes, stop, stopped))
+        finally:
+            get_reusable_executor().shutdown(kill_workers=stop.is_set())  # else joblib keeps them, in this folder, for whoever calls next
 
 
 def _on_cluster(question: Question, paths: Sequence[str], address: str, jobs: int | None) -> Generator[Answer]:
@@ -192,27 +209,51 @@ def _answers(question: Question, paths: Sequence[str], attempt: Callable[[list[T
             yield question.failed(*task, SolverError(KILLED))
 
 
-def _in_processes(question: Question, jobs: int, tasks: list[Task], killed: list[Task]) -> Iterator[Answer]:
-    """An attempt with joblib. Where a process is killed, joblib gives up all that is under way; the rest goes on in new processes."""
+def _in_processes(
+    question: Question, jobs: int, stop: threading.Event, stopped: Path | None, tasks: list[Task], killed: list[Task]
+) -> Iterator[Answer]:
+    """An attempt with joblib. Where a process is killed, joblib gives up all that is under way; the rest goes on in new processes.
+
+    stopped  the file that tells other processes to stop: they do not heed Ctrl-C but while they search
+    """
     from joblib import Parallel, delayed
 
     waiting = dict(tasks)
-    while waiting:
+    while waiting and not stop.is_set():
         begun: list[int] = []
-        work = (delayed(question.answer)(*task) for task in _noted([*waiting.items()], begun))
+        given_up = partial(os.path.exists, stopped) if stopped else stop.is_set
+        work = (delayed(question.answer)(*task, None, given_up) for task in _noted([*waiting.items()], begun, stop))
+        parallel = Parallel(min(jobs, max(2, len(waiting))), batch_size=1, pre_dispatch="n_jobs", return_as="generator_unordered")
         try:
-            for answer in Parallel(min(jobs, max(2, len(waiting))), batch_size=1, return_as="generator_unordered")(work):
+            with _ignored_ctrl_c() if stopped else contextlib.nullcontext():
+                answers = parallel(work)
+            for answer in answers:
                 del waiting[answer.number]
                 yield answer
         except BrokenExecutor:
             killed += [(number, waiting.pop(number)) for number in begun if number in waiting]
 
 
-def _noted(tasks: Iterable[Task], begun: list[int]) -> Iterator[Task]:
-    """The tasks, while it is written down which were begun."""
+def _noted(tasks: Iterable[Task], begun: list[int], stop: threading.Event) -> Iterator[Task]:
+    """The tasks until it is to stop, while it is written down which were begun."""
     for task in tasks:
+        if stop.is_set():
+            return
         begun.append(task[0])
         yield task
+
+
+@contextlib.contextmanager
+def _ignored_ctrl_c() -> Iterator[None]:
+    """Ctrl-C does nothing, nor in processes that begin now."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may handle signals
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _on_workers(question: Question, client: Client, most: int, tasks: list[Task], killed: list[Task]) -> Iterator[Answer]:
