@@ -92,5 +92,6 @@ SUITE = {
     )
 }
 SMALL = _maze(2, 60, full=True)  # what the full theory's plain encoding can still do: for ablation.py
-BARE = Instance("full maze 3x3 n=400, no stars", lambda seed: maze(3, 3, steps=400, seed=seed))  # where a map with frames is sought
+# Where a map with frames is sought:
+BARE = Instance("full maze 3x3 n=400, loops, no stars", lambda seed: maze(3, 3, steps=400, seed=seed, loops=0.5))
 INSTANCES = {**SUITE, SMALL.name: SMALL, BARE.name: BARE}

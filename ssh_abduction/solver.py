@@ -64,7 +64,7 @@ HELD_BACK = 1000  # maps kept until a prefix proves long enough; from there on t
 FIRST_PATHS = 8  # names for paths to begin with
 FEW_STEPS = 24  # of a trace or a prefix; so many are solved sooner without names, a map made greedily, or a question from below
 FRAME_AFTER = 1.0  # seconds after which a map with frames is sought, where the theory does not ask for one
-FRAMING = 20.0  # seconds that this may take, at most
+FRAMING = 30.0  # seconds that this may take, at most
 FRAMING_SHARE = 0.4  # of the time that is left, for either, if that is less
 ALL = Speedups()
 
@@ -239,7 +239,7 @@ class Search:
             raise TraceError(f"trace: expected a Trace, got {brief(trace)}; make one with Trace.load or Trace.from_steps")
         if not isinstance(theory, Theory | None):
             raise TheoryError(f"theory: expected a Theory, got {brief(theory)}; take Theory.topological(), Theory.causal() or Theory(…)")
-        if isinstance(maps, bool) or not isinstance(maps, int):
+        if isinstance(maps, bool) or not hasattr(maps, "__index__"):
             raise SolverError(f"maps (--maps): expected a whole number, 0 for all, got {brief(maps)}")
         for name, value in (("limit (--time-limit)", limit), ("memory (--memory-limit)", memory)):
             if isinstance(value, bool) or not isinstance(value, int | float | None):
