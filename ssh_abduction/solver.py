@@ -264,6 +264,7 @@ class Search:
         self._apart: Evidence | None = None  # of the whole trace, where the search was stopped
         self._most = maps
         self._memory = memory
+        self._goes_on = after is not None
         self._log = Log(trace, self.theory)
         self._whole = not speedups.prefixes or bool(self.theory.without)
         self._speedups = speedups
@@ -425,9 +426,9 @@ class Search:
         return self._find_cost()
 
     def _may_frame(self) -> bool:
-        """Whether a map in which places have frames is worth seeking, and the trace not too long for that."""
+        """Whether a map in which places have frames is worth seeking, and the trace not too long for that. While a robot drives there are sketches."""
         known = self._speedups.framing and isinstance(self._engine, StepEngine) and self.theory.with_frames() is not None
-        return known and FEW_STEPS < len(self.trace) <= AT_ONCE
+        return known and not self._goes_on and FEW_STEPS < len(self.trace) <= AT_ONCE
 
     def _frame(self) -> None:
         """Seek maps in which places have frames."""

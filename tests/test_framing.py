@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import theories, traces
 
-from ssh_abduction import Search, Speedups, SSHMap, Status, Theory, Trace, framing, solve, solver
+from ssh_abduction import OnlineMapper, Search, Speedups, SSHMap, Status, Theory, Trace, framing, solve, solver
 from ssh_abduction.asking import Paused, Stopped, Watch
 from ssh_abduction.checker import check
 from ssh_abduction.framing import maps_with_frames
@@ -116,6 +116,18 @@ def test_a_sketch_with_frames_is_smaller(theory: Theory) -> None:
         sizes.append(len(sketch.map().dstates))
     framed, homing, *_ = sizes[0], sizes[2]
     assert framed < homing / 2
+
+
+def test_while_a_robot_drives_the_time_is_clingos() -> None:
+    """The sketch is small enough. The robot was in 27 dstates."""
+    trace = maze(3, 3, steps=120, seed=0).trace
+    mapper = OnlineMapper(trace.steps[0].view or "", limit=0.05)
+    with patch.object(framing, "maps_with_frames", side_effect=AssertionError), patch.object(solver, "FRAME_AFTER", -1.0):
+        for action, step in zip(trace.actions, trace.steps[1:], strict=True):
+            answer = mapper.observe(action, step.view or "")
+    assert answer.cost
+    assert answer.cost.dstates <= 1.2 * 27
+    assert check(trace, answer.maps[0], answer.theory) == ()
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt(), Stopped("time limit"), Stopped("interrupted")], ids=["ctrl-c", "limit", "interrupt"])

@@ -176,7 +176,7 @@ def test_nothing_preferred_means_all_consistent_maps() -> None:
 
 def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
     trace = too_hard()
-    solution = solve(trace, Theory.causal(), limit=3)
+    solution = solve(trace, Theory.causal(), limit=2)
     assert solution.stopped == "time limit"
     assert solution.status is Status.FEASIBLE
     assert solution.count == 1
@@ -206,7 +206,7 @@ def test_no_time_at_all_still_leaves_a_map_and_a_bound(theory: Theory) -> None:
 
 def test_time_limit_while_listing_keeps_the_proof() -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=())
-    solution = solve(rectangle(24), theory, limit=3, maps=0)
+    solution = solve(rectangle(24), theory, limit=2, maps=0)
     assert (solution.status, solution.complete, solution.stopped) == (Status.OPTIMAL, False, "time limit")
     assert solution.count > 0
 
@@ -439,9 +439,9 @@ def test_costs_are_right_where_a_map_cannot_show_them() -> None:
 
 def test_the_time_of_the_caller_does_not_count() -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
-    search = Search(drive(*TOURS["comb"]), theory, maps=5, limit=4)
+    search = Search(drive(*TOURS["comb"]), theory, maps=5, limit=2)
     for _ in search:
-        time.sleep(1)
+        time.sleep(0.5)
     assert (search.count, search.stopped) == (5, "maps limit")
 
 
