@@ -87,6 +87,13 @@ class Watch:
     def stop(self) -> None:
         self._spent, self._started = self.elapsed(), None
 
+    def part(self, seconds: float) -> Watch:
+        """A watch, started, for so many seconds of this one's time, which is looked at now and then."""
+        part = Watch(seconds, self._memory, self.check)
+        part.use_reserve()
+        part.start()
+        return part
+
     def pause_after(self, seconds: float) -> None:
         """Let `check` raise Paused, once, when so much time was spent."""
         self._pause_at = seconds

@@ -49,7 +49,7 @@ from ssh_abduction.errors import TraceError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.replay import Outcome, observation
 from ssh_abduction.sketch import Sketch
-from ssh_abduction.solver import ALL, Cost, Search, Seconds, Solution, Status, has_frames
+from ssh_abduction.solver import ALL, Cost, Search, Seconds, Solution, Status
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Step, Trace, View
@@ -91,7 +91,7 @@ class OnlineMapper:
         self.theory = theory.resolve(Trace((first,)))
         if theory.level == "causal":  # now rather than at the step that first needs it, as it takes its time
             importlib.import_module("ssh_abduction.named")
-        elif has_frames(self.theory):
+        elif self.theory.has_frames:
             importlib.import_module("ssh_abduction.guessing")
         began = time.perf_counter()
         self.searches = 0  # how often clingo was asked
@@ -213,8 +213,7 @@ class OnlineMapper:
         return True
 
     def _rank(self, sketch: Sketch) -> tuple[int, ...]:
-        cost = Cost.of(sketch.map())
-        return tuple(getattr(cost, name) for name in self.theory.priorities)
+        return Cost.of(sketch.map()).preferred_by(self.theory)
 
     def _let_guess(self, may_run: bool) -> None:
         """Let a guess go on while the robot drives, and not where it would hold up a step."""
@@ -225,7 +224,7 @@ class OnlineMapper:
 
     def _may_guess(self) -> bool:
         """Whether a small map is wanted, and the steps are not too many to be compared in pairs."""
-        return self._status is Status.UNKNOWN and self._limit is not None and has_frames(self.theory) and len(self._steps) <= AT_ONCE
+        return self._status is Status.UNKNOWN and self._limit is not None and self.theory.has_frames and len(self._steps) <= AT_ONCE
 
     def _heed_guess(self) -> None:
         """Take the map that came of a guess."""

@@ -69,17 +69,6 @@ FRAMING_SHARE = 0.4  # of the time that is left, for either, if that is less
 ALL = Speedups()
 
 
-def has_frames(theory: Theory) -> bool:
-    """Whether framed.py knows the axioms of a theory, and its preference."""
-    return (
-        theory.star == "frame"
-        and theory.priorities[:1] == ("dstates",)
-        and theory.boundary in ("none", "strict")
-        and theory.path_order == "total"
-        and not (theory.next_place or theory.all_on_paths or theory.without)
-    )
-
-
 class Status(Enum):
     """What is known about the trace."""
 
@@ -101,6 +90,10 @@ class Cost:
     @staticmethod
     def of(ssh_map: SSHMap) -> Cost:
         return Cost(len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.excused))
+
+    def preferred_by(self, theory: Theory) -> tuple[int, ...]:
+        """The counts that a theory prefers, first to last."""
+        return tuple(getattr(self, name) for name in theory.priorities)
 
     def to_dict(self) -> dict[str, int]:
         counts = {"dstates": self.dstates, "places": self.places, "paths": self.paths}
@@ -263,7 +256,6 @@ class Search:
         self._begun = False
         self._apart: Evidence | None = None  # of the whole trace, where the search was stopped
         self._most = maps
-        self._memory = memory
         self._goes_on = after is not None
         self._log = Log(trace, self.theory)
         self._whole = not speedups.prefixes or bool(self.theory.without)
@@ -291,7 +283,7 @@ class Search:
         """Whether the theory lets dstates have names beforehand, and the trace is long enough for that to pay."""
         theory = self.theory
         causal = theory.level == "causal" and theory.prefer == ("dstates",) and not theory.without
-        return (causal or has_frames(theory)) and self._speedups.names and len(self.trace) > FEW_STEPS
+        return (causal or theory.has_frames) and self._speedups.names and len(self.trace) > FEW_STEPS
 
     def _new_engine(self) -> Engine:
         theory = self.theory
@@ -435,12 +427,9 @@ class Search:
         from ssh_abduction.framing import maps_with_frames  # loads numpy
 
         seconds = min(FRAMING, FRAMING_SHARE * self._watch.left())
-        beside = Watch(seconds, self._memory, self._watch.check)
-        beside.use_reserve()
-        beside.start()
         try:
-            for found in maps_with_frames(self.trace, self.theory, beside, self._speedups):
-                cost = self._cost_of(found)
+            for found in maps_with_frames(self.trace, self.theory, self._watch.part(seconds), self._speedups):
+                cost = Cost.of(found).preferred_by(self.theory)
                 if self.best is None or cost < self._cost:
                     self._keep(Found(found, cost), found.labels)
                     self._report()
@@ -495,7 +484,7 @@ class Search:
         for sketch in Sketch.all_of(first, self.theory):
             if all(sketch.extend(action, step) for action, step in zip(self.trace.actions, rest, strict=True)):
                 found = sketch.map()
-                self._keep(Found(found, self._cost_of(found)), found.labels)
+                self._keep(Found(found, Cost.of(found).preferred_by(self.theory)), found.labels)
                 return
 
     def _minimise(self) -> Found | None:
@@ -604,10 +593,6 @@ class Search:
         self._raise_bound(self._engine.bound)
         self._engine.settle()
         self._watch.stop()
-
-    def _cost_of(self, ssh_map: SSHMap) -> tuple[int, ...]:
-        cost = Cost.of(ssh_map)
-        return tuple(getattr(cost, name) for name in self.theory.priorities)
 
     def _best_cost(self) -> Cost | None:
         """The counts of the best map; where axioms are left out, clingo may count more places or paths than the map can show."""

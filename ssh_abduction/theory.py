@@ -124,18 +124,29 @@ class Theory:
         """The names of the axioms that hold. With star=auto, those of a trace without stars."""
         return tuple(a.name for a in encodings.axioms() if a.name not in self.without and a.holds_in(vars(self)))
 
+    @property
+    def has_frames(self) -> bool:
+        """Whether places have frames, and framed.py knows the axioms and the preference."""
+        return (
+            self.star == "frame"
+            and self.priorities[:1] == ("dstates",)
+            and self.boundary in ("none", "strict")
+            and self.path_order == "total"
+            and not (self.next_place or self.all_on_paths or self.without)
+        )
+
     def with_frames(self) -> Theory | None:
         """A theory in which places have frames and fewest dstates come first, and whose maps, but for their headings, are maps of this one.
 
-        None where there is no such theory, or framed.py does not know it: in the causal theory, in one without some axioms, and with
-        next_place or all_on_paths. The trace need have no stars. Its maps have all axioms of this theory: their paths are totally
+        None where there is no such theory, or framed.py does not know it (`has_frames`). The trace need have no stars. Its maps have all axioms of this theory: their paths are totally
         ordered, their boundaries, if there are any, strict, so that no pair of paths is excused, and stars that agree in a frame are one pattern.
         """
-        if self.level == "causal" or self.without or self.next_place or self.all_on_paths:
+        if self.level == "causal":
             return None
         boundary = "none" if self.boundary == "none" else "strict"
         rest = [count for count in self.prefer if count in ("paths", "places")]
-        return self.replace(star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest))
+        framed = self.replace(star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest))
+        return framed if framed.has_frames else None
 
     def resolve(self, trace: Trace) -> Theory:
         """This theory with `star` settled for a trace, after checking that the trace has what the axioms need.

@@ -11,7 +11,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,7 +23,7 @@ from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Speedups, Theory, Trace
 from ssh_abduction.cli import batch, main
-from ssh_abduction.cli.batch import Answer, Question
+from ssh_abduction.cli.batch import Answer, Question, Stop
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ENDLESS = ["--boundary", "none", "--path-order", "partial", "--prefer", "", "-n", "0"]  # a theory in which slow.jsonl has maps without end
@@ -175,7 +174,8 @@ def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -
 def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler: str) -> None:
     deadly = Deadly(*(getattr(QUESTION, name) for name in Question.__slots__))
     paths = [f"{name}.jsonl" for name in ("quick", "deadly", "comb", "quick")]
-    for answers in (batch._here(deadly, paths, 2, threading.Event()), batch._on_cluster(deadly, paths, scheduler, None)):
+    stop = Stop(traces / "stop")
+    for answers in (batch._here(deadly, paths, 2, stop), batch._on_cluster(deadly, paths, scheduler, None, stop)):
         lines = {answer.number: answer.line for answer in answers}
         assert sorted(lines) == [*range(len(paths))]
         for number, path in enumerate(paths):
@@ -185,12 +185,12 @@ def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler:
 def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler: str) -> None:
     theory = Theory.topological().replace(boundary="none", path_order="partial", prefer=())
     endless = Question(theory, limit=30, maps=0, memory=None, speedups=Speedups(), json=False)
-    answers = batch._on_cluster(endless, ["quick.jsonl", "slow.jsonl"], scheduler, None)
+    answers = batch._on_cluster(endless, ["quick.jsonl", "slow.jsonl"], scheduler, None, Stop(traces / "stop"))
     assert next(answers).number == 0
     time.sleep(0.5)  # the only thread of the worker is at the slow one
     answers.close()
     began = time.monotonic()
-    assert [answer.code for answer in batch._on_cluster(QUESTION, ["comb.jsonl"], scheduler, None)] == [0]
+    assert [answer.code for answer in batch._on_cluster(QUESTION, ["comb.jsonl"], scheduler, None, Stop(traces / "stop"))] == [0]
     assert time.monotonic() - began < 15
 
 

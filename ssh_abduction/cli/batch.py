@@ -10,12 +10,9 @@ import contextlib
 import ctypes
 import gc
 import logging
-import os
 import re
-import signal
 import sys
 import tempfile
-import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError
@@ -51,6 +48,19 @@ class Answer(NamedTuple):
     number: int
     line: str
     code: int
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Whether all is to stop, which this file says: so other processes hear of it, too."""
+
+    file: Path
+
+    def set(self) -> None:
+        self.file.touch()
+
+    def is_set(self) -> bool:
+        return self.file.exists()
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,15 +119,30 @@ def run(options: argparse.Namespace) -> int:
     if options.scheduler or options.jobs not in (None, 1):
         speedups = replace(speedups, threads=False)  # the processors have other traces to solve
     question = Question(theory_of(options), options.time_limit, options.maps, options.memory_limit, speedups, options.json)
-    stop = threading.Event()
-    if options.scheduler is None:
-        answers = _here(question, paths, options.jobs or 1, stop)
-    else:
-        answers = _on_cluster(question, paths, options.scheduler, options.jobs)
+    with tempfile.TemporaryDirectory() as folder:
+        stop = Stop(Path(folder) / "stop")
+        if options.scheduler is None:
+            answers = _here(question, paths, options.jobs or 1, stop)
+        else:
+            answers = _on_cluster(question, paths, options.scheduler, options.jobs, stop)
+        codes = _printed(answers, len(paths), stop)
+        stopped = stop.is_set()
+    if stopped:
+        missing = len(paths) - sum(code != EXIT_INTERRUPTED for code in codes)
+        print(f"ssh-abduction: interrupted: {missing} of {len(paths)} traces not finished", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    if errors := codes.count(EXIT_ERROR):
+        print(f"ssh-abduction: errors in {errors} of {len(paths)} traces, on their lines", file=sys.stderr)
+        return EXIT_ERROR
+    return max(codes)
+
+
+def _printed(answers: Generator[Answer], total: int, stop: Stop) -> list[int]:
+    """Print the lines of all answers in the order of the traces. Returns the codes of those that came."""
     lines: dict[int, str] = {}  # of answers whose turn has not come
     codes: list[int] = []
     turn = 0
-    with _progress(len(paths)) as (say, advance), contextlib.closing(answers):
+    with _progress(total) as (say, advance), contextlib.closing(answers):
         try:
             for answer in answers:
                 with on_ctrl_c(stop.set):  # so that no line is lost or cut in two
@@ -129,23 +154,14 @@ def run(options: argparse.Namespace) -> int:
                         turn += 1
                 if answer.code == EXIT_INTERRUPTED:
                     stop.set()
-            if stop.is_set():
-                raise KeyboardInterrupt
         except KeyboardInterrupt:
             stop.set()
-            for number in sorted(lines):
-                say(lines[number])
-    if stop.is_set():
-        missing = len(paths) - sum(code != EXIT_INTERRUPTED for code in codes)
-        print(f"ssh-abduction: interrupted: {missing} of {len(paths)} traces not finished", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    if errors := codes.count(EXIT_ERROR):
-        print(f"ssh-abduction: errors in {errors} of {len(paths)} traces, on their lines", file=sys.stderr)
-        return EXIT_ERROR
-    return max(codes)
+        for number in sorted(lines):  # where some did not come
+            say(lines[number])
+    return codes
 
 
-def _here(question: Question, paths: Sequence[str], jobs: int, stop: threading.Event) -> Generator[Answer]:
+def _here(question: Question, paths: Sequence[str], jobs: int, stop: Stop) -> Generator[Answer]:
     """Answers from processes of this machine; with one job, from this process. Once it is to stop, those of traces under way, as far as these are."""
     from joblib import effective_n_jobs
     from joblib.externals.loky import get_reusable_executor
@@ -153,25 +169,22 @@ def _here(question: Question, paths: Sequence[str], jobs: int, stop: threading.E
     warnings.filterwarnings("ignore", module="joblib")  # about processes that ended early: the answers say it better
     processes = min(effective_n_jobs(jobs), len(paths))
     if processes == 1:
-        yield from _answers(question, paths, partial(_in_processes, question, 1, stop, None))
+        yield from _answers(question, paths, partial(_in_processes, question, 1, stop))
         return
-    with tempfile.TemporaryDirectory() as folder:
-        stopped = Path(folder) / "stopped"
 
-        def end() -> None:
-            if stop.is_set():  # Ctrl-C once more
-                raise KeyboardInterrupt
-            stop.set()
-            stopped.touch()
+    def end() -> None:
+        if stop.is_set():  # Ctrl-C once more
+            raise KeyboardInterrupt
+        stop.set()
 
-        try:
-            with on_ctrl_c(end):
-                yield from _answers(question, paths, partial(_in_processes, question, processes, stop, stopped))
-        finally:
-            get_reusable_executor().shutdown(kill_workers=stop.is_set())  # else joblib keeps them, in this folder, for whoever calls next
+    try:
+        with on_ctrl_c(end):
+            yield from _answers(question, paths, partial(_in_processes, question, processes, stop))
+    finally:
+        get_reusable_executor().shutdown(kill_workers=stop.is_set())  # else joblib keeps them, in this folder, for whoever calls next
 
 
-def _on_cluster(question: Question, paths: Sequence[str], address: str, jobs: int | None) -> Generator[Answer]:
+def _on_cluster(question: Question, paths: Sequence[str], address: str, jobs: int | None, stop: Stop) -> Generator[Answer]:
     """Answers from the workers of a Dask scheduler."""
     try:
         from distributed import Client
@@ -191,7 +204,10 @@ def _on_cluster(question: Question, paths: Sequence[str], address: str, jobs: in
         except TimeoutError:
             raise SSHError(f"--scheduler: expected a worker, got none in {PATIENCE} s; start one with: dask worker {address}") from None
         most = jobs if jobs is not None and jobs > 0 else 2 * sum(client.ncores().values())
-        yield from _answers(question, paths, partial(_on_workers, question, client, most))
+        for answer in _answers(question, paths, partial(_on_workers, question, client, most)):
+            yield answer
+            if stop.is_set():
+                return
 
 
 def _answers(question: Question, paths: Sequence[str], attempt: Callable[[list[Task], list[Task]], Iterator[Answer]]) -> Iterator[Answer]:
@@ -209,23 +225,20 @@ def _answers(question: Question, paths: Sequence[str], attempt: Callable[[list[T
             yield question.failed(*task, SolverError(KILLED))
 
 
-def _in_processes(
-    question: Question, jobs: int, stop: threading.Event, stopped: Path | None, tasks: list[Task], killed: list[Task]
-) -> Iterator[Answer]:
+def _in_processes(question: Question, jobs: int, stop: Stop, tasks: list[Task], killed: list[Task]) -> Iterator[Answer]:
     """An attempt with joblib. Where a process is killed, joblib gives up all that is under way; the rest goes on in new processes.
 
-    stopped  the file that tells other processes to stop: they do not heed Ctrl-C but while they search
+    Other processes do not heed Ctrl-C but while they search; the file tells them.
     """
     from joblib import Parallel, delayed
 
     waiting = dict(tasks)
     while waiting and not stop.is_set():
         begun: list[int] = []
-        given_up = partial(os.path.exists, stopped) if stopped else stop.is_set
-        work = (delayed(question.answer)(*task, None, given_up) for task in _noted([*waiting.items()], begun, stop))
+        work = (delayed(question.answer)(*task, None, stop.is_set) for task in _noted([*waiting.items()], begun, stop))
         parallel = Parallel(min(jobs, max(2, len(waiting))), batch_size=1, pre_dispatch="n_jobs", return_as="generator_unordered")
         try:
-            with _ignored_ctrl_c() if stopped else contextlib.nullcontext():
+            with on_ctrl_c(None) if jobs > 1 else contextlib.nullcontext():
                 answers = parallel(work)
             for answer in answers:
                 del waiting[answer.number]
@@ -234,26 +247,13 @@ def _in_processes(
             killed += [(number, waiting.pop(number)) for number in begun if number in waiting]
 
 
-def _noted(tasks: Iterable[Task], begun: list[int], stop: threading.Event) -> Iterator[Task]:
+def _noted(tasks: Iterable[Task], begun: list[int], stop: Stop) -> Iterator[Task]:
     """The tasks until it is to stop, while it is written down which were begun."""
     for task in tasks:
         if stop.is_set():
             return
         begun.append(task[0])
         yield task
-
-
-@contextlib.contextmanager
-def _ignored_ctrl_c() -> Iterator[None]:
-    """Ctrl-C does nothing, nor in processes that begin now."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may handle signals
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _on_workers(question: Question, client: Client, most: int, tasks: list[Task], killed: list[Task]) -> Iterator[Answer]:

@@ -166,12 +166,12 @@ def _print_text(search: Search, solution: Solution, explanation: Explanation | N
 
 
 @contextlib.contextmanager
-def on_ctrl_c(action: Callable[[], None]) -> Iterator[None]:
-    """Ctrl-C does this, rather than stop the program wherever it is: what was found is still printed."""
+def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
+    """Ctrl-C does this, rather than stop the program wherever it is: what was found is still printed. None: nothing, nor in processes that begin."""
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may handle signals
         return
-    before = signal.signal(signal.SIGINT, lambda *_: action())
+    before = signal.signal(signal.SIGINT, (lambda *_: action()) if action else signal.SIG_IGN)
     try:
         yield
     finally:
