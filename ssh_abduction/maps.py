@@ -203,8 +203,8 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     """The JSON value in a file. Raises MapError that names the file and the line."""
     source = "standard input" if str(path) == "-" else named(path)
     try:
-        text = sys.stdin.read() if str(path) == "-" else FilePath(path).read_text(encoding="utf-8")
-        return json.loads(text)
+        text = sys.stdin.buffer.read() if str(path) == "-" else FilePath(path).read_bytes()
+        return json.loads(text.decode("utf-8"))
     except OSError as error:
         raise MapError(f"{source}: expected a readable file of maps: {error.strerror or error}; check the path") from None
     except json.JSONDecodeError as error:

@@ -195,6 +195,24 @@ def test_flags_are_laid_over_the_theory_of_the_file(tmp_path: Path, capsys: pyte
         assert message in capsys.readouterr().err
 
 
+def test_one_is_not_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = saved(Trace.from_steps("a", []), tmp_path)
+    assert main(["solve", path, "--theory", "topological"]) == 0
+    assert capsys.readouterr().out.startswith("optimal: 1 dstate, 1 place, 0 paths; 1 minimal map; ")
+    assert main(["solve", path, "--json"]) == 0
+    maps = tmp_path / "maps.json"
+    maps.write_text(capsys.readouterr().out)
+    assert main(["check", "--bound", path, str(maps)]) == 0
+    assert "at least 1 dstate: as many steps" in capsys.readouterr().out
+
+
+def test_the_bound_of_an_answer_without_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str], solved: Path) -> None:
+    bare = tmp_path / "bare.json"
+    bare.write_text(json.dumps({**json.loads(solved.read_text()), "maps": []}))
+    assert main(["check", "--bound", ACES, str(bare)]) == 0
+    assert "at least 19 dstates, if clingo is right" in capsys.readouterr().out
+
+
 def test_check_takes_one_saved_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trace = rectangle(8)
     (ssh_map,) = solve(trace).maps
@@ -393,7 +411,8 @@ def test_what_programs_read_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
     assert [s["view"] for s in json.loads(maps)["maps"][0]["dstates"]] == ["日本", "中国", "Küche"]
     assert 'view(1,"中国").' in printed("facts", path)
     for form in ("--svg", "--graphml"):
-        ET.fromstring(printed("show", "-", form, given=maps.encode()))
+        drawn = ET.fromstring(printed("show", "-", form, given=maps.encode()))
+        assert "日本" in "".join(drawn.itertext())
 
 
 @pytest.mark.parametrize(
@@ -419,6 +438,7 @@ def test_errors_say_what_mends_them(tmp_path: Path, capsys: pytest.CaptureFixtur
         (["show", str(many)], "many.jsonl:2: expected one JSON value, got more after it; solve prints a line for each of several traces"),
         (["show", str(none), "--svg"], "maps: expected one to draw, got none"),
         (["show", str(none), "--map", "1"], "--map: expected a map, got none"),
+        (["check", ACES, str(none)], "maps: expected one to check, got none"),
         (["train", ACES, str(solved), "--map", "5", "-o", "x"], "--map: expected 1 to 4, got 5"),
         (["reproduce", "notched-rectangle", "--jobs", "0"], "--jobs: expected how many processes"),
         (["reproduce", "notched-rectangle", "--seeds", "0", "--jobs", "1", "-o", str(taken)], "File exists; take another name"),

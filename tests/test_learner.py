@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import io
 import json
 import subprocess
 import sys
@@ -239,6 +240,20 @@ def test_from_simulation_to_recognition_in_the_shell(tmp_path: Path, capsys: pyt
     assert np.mean(np.array(labels) == [i % 8 for i in range(16)]) > 0.8
     assert main(["recognise", path("recogniser.skops"), path("other.jsonl")]) == 0
     assert capsys.readouterr().out.splitlines()[0].split() == ["step", "dstate"]
+
+
+def test_traces_go_through_pipes(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is said of them is said on standard error."""
+    assert main(["simulate", "notched-rectangle", "--tours", "10", "--seed", "3", "-o", "-"]) == 0
+    driven = capsys.readouterr()
+    assert driven.err == "80 images of notched rectangle\n"
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(driven.out.encode())))
+    assert main(["cluster", "-", "--k", "4", "-o", "-"]) == 0
+    clustered = capsys.readouterr()
+    assert clustered.err.endswith("4 views of 80 images\n")
+    path = tmp_path / "views.jsonl"
+    path.write_text(clustered.out)
+    assert len(set(Trace.load(path).views)) == 4
 
 
 def test_errors_of_the_wings_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

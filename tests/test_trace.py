@@ -114,6 +114,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     "negative index": ([HEADER, '{"image": -1}'], "2: image: expected an index"),
     "broken JSON": ([HEADER, STEP, '{"view": "b"'], "3: line: expected one JSON object, got broken JSON at column 13"),
     "two objects on a line": ([HEADER, LAST + LAST], "2: line: expected one JSON object, got broken JSON"),
+    "a field twice": ([HEADER, '{"view": "a", "view": "b"}'], "2: line: expected one JSON object, got the field 'view' twice"),
     "empty line inside": ([HEADER, STEP, "", LAST], "3: line: expected a step, got an empty line"),
     "a number on a line": ([HEADER, "5"], "2: line: expected a JSON object in braces, got 5"),
     "NaN in the truth": (

@@ -55,7 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that knows no "→" shows "?"
-    if isinstance(sys.stdout, io.TextIOWrapper) and any(getattr(options, form, False) for form in FOR_PROGRAMS):
+    for_programs = any(getattr(options, form, False) for form in FOR_PROGRAMS) or getattr(options, "output", None) == "-"
+    if isinstance(sys.stdout, io.TextIOWrapper) and for_programs:
         sys.stdout.reconfigure(encoding="utf-8", errors="backslashreplace")  # what is left is half a character, which JSON writes so
     try:
         if sys.stdout is None:

@@ -8,6 +8,7 @@ from typing import Any
 from ssh_abduction.certificate import RESTS_ON
 from ssh_abduction.checker import check
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.cli.text import counted
 from ssh_abduction.errors import MapError
 from ssh_abduction.maps import maps_of, read_json
 from ssh_abduction.proof import check_bound
@@ -35,6 +36,10 @@ def run(options: argparse.Namespace) -> int:
     solved = None if found is None else Theory.from_dict(found)
     theory = theory_of(options, solved)
     maps = maps_of(data, str(options.maps))
+    if not maps and not options.bound:
+        raise MapError(
+            f"{options.maps}: maps: expected one to check, got none; see the status that solve printed, or check its bound (--bound)"
+        )
     broken = 0
     for i, ssh_map in enumerate(maps):
         violations = check(trace, ssh_map, theory)
@@ -71,13 +76,14 @@ def _bound(trace: Trace, data: Any, theory: Theory, fewest: int | None, doubt: s
     if bound.faults:
         return False
     pairs = bound.dstates * (bound.dstates - 1) // 2
-    print(f"at least {bound.dstates} dstates: as many steps, of which no two can be one dstate ({pairs} pairs checked)")
+    states = counted(bound.dstates, "dstates")
+    print(f"at least {states}: as many steps, of which no two can be one dstate ({counted(pairs, 'pairs')} checked)")
     total = bound.dstates + (0 if doubt else len(bound.refuted))
     if bound.refuted and doubt:
-        print(f"clingo's verdict on {bound.refuted[0]} dstates and more is left out: {doubt}")
+        print(f"clingo's verdict on {counted(bound.refuted[0], 'dstates')} and more is left out: {doubt}")
     elif bound.refuted:
         sizes = f"{bound.refuted[0]} to {total - 1}" if len(bound.refuted) > 1 else str(bound.refuted[0])
-        print(f"at least {total} dstates, if clingo is right that there is no map of {sizes}")
+        print(f"at least {counted(total, 'dstates')}, if clingo is right that there is no map of {sizes}")
     if fewest is not None:
         beyond = "fewer than that, so this bound or a map is wrong" if fewest < total else f"{fewest - total} more than proven"
         print(f"the maps have {fewest}" + (": no map has fewer" if fewest == total else f", {beyond}"))

@@ -8,8 +8,8 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from ssh_abduction.cli.options import Verbs, picture_file, seed
-from ssh_abduction.cli.text import table
+from ssh_abduction.cli.options import Verbs, add_output, picture_file, seed, write
+from ssh_abduction.cli.text import counted, table
 from ssh_abduction.errors import SSHError
 from ssh_abduction.trace import Trace
 
@@ -18,7 +18,7 @@ def add_parser(verbs: Verbs) -> None:
     text = "Cluster the images of a trace into views, as many as separate best (k by M), and write the trace with its views."
     parser = verbs.add_parser("cluster", help="cluster images into views", description=text)
     parser.add_argument("trace", help="trace file with images, or - for standard input")
-    parser.add_argument("-o", "--output", required=True, metavar="TRACE", help="trace file to write")
+    add_output(parser)
     parser.add_argument("--k", type=int, help="number of views (default: the one with the largest M)")
     parser.add_argument("--k-max", type=int, metavar="K", help="largest number of views to try (default: 20)")
     parser.add_argument("--seed", type=seed, default=0, help="seed of k-means (default: 0)")
@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
     if truth is not None:
         uncertainty = {k: uncertainty_coefficient(labels, truth) for k, labels in labels_by_k(clusterer, images).items()}
     beside = trace.images and os.path.relpath(Path(trace.source or ".").parent / trace.images, Path(options.output).parent)
-    replace(trace.with_views(clusterer.labels_.tolist()), images=beside).save(options.output)
+    clustered = replace(trace.with_views(clusterer.labels_.tolist()), images=beside)
     rows = [
         [
             k,
@@ -55,8 +55,8 @@ def run(options: argparse.Namespace) -> int:
         ]
         for k, m in clusterer.quality_.items()
     ]
-    print(table(["k", "M", *(["U"] if uncertainty else []), ""], rows))
-    print(f"{clusterer.k_} views of {len(images)} images in {options.output}")
+    chosen = table(["k", "M", *(["U"] if uncertainty else []), ""], rows)
+    write(clustered, options.output, f"{chosen}\n{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}")
     if options.plot:
         from ssh_abduction.reproduce.figures import draw_quality
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 from ssh_abduction.errors import MapError
 from ssh_abduction.theory import CHOICES, COUNTS, PRESETS, Theory
+from ssh_abduction.trace import Trace
 
 Verbs = Any  # argparse's type for what add_subparsers returns is private
 
@@ -28,6 +30,21 @@ def add_theory(parser: argparse.ArgumentParser, default: str = "topological, or 
         group.add_argument(f"--{name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=text)
     group.add_argument("--prefer", metavar="COUNTS", help=f"what to minimise, first to last, of {', '.join(COUNTS)}; commas between")
     group.add_argument("--without", metavar="AXIOMS", help="leave these axioms out; commas between")
+
+
+def add_output(parser: argparse.ArgumentParser) -> None:
+    """Add -o TRACE."""
+    parser.add_argument("-o", "--output", required=True, metavar="TRACE", help="trace file to write, or - for standard output")
+
+
+def write(trace: Trace, output: str, said: str) -> None:
+    """Write a trace where add_output says, and what is said of it: beside it, where the trace goes to standard output."""
+    if output == "-":
+        sys.stdout.writelines(line + "\n" for line in trace.to_lines())
+        print(said, file=sys.stderr)
+    else:
+        trace.save(output)
+        print(f"{said} in {output}")
 
 
 def seed(text: str) -> int:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.options import Verbs, seed
+from ssh_abduction.cli.options import Verbs, add_output, seed, write
+from ssh_abduction.cli.text import counted
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -18,7 +19,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("--start", metavar="X,Y,DEGREES", help="another start than the world's; write --start=-1,2,90")
     parser.add_argument("--route", metavar="ACTIONS", help="another route than the world's; travel, right, left, around with commas")
     parser.add_argument("--reach", type=float, metavar="M", help="metres from a wall at which the robot follows it")
-    parser.add_argument("-o", "--output", required=True, metavar="TRACE", help="trace file to write")
+    add_output(parser)
     parser.set_defaults(run=run)
 
 
@@ -28,6 +29,5 @@ def run(options: argparse.Namespace) -> int:
 
     world = World.named(options.world).with_choices(options.start, options.route, options.reach)
     trace = simulate(world, options.tours, options.seed, stars=not options.no_stars, every=options.every)
-    trace.save(options.output)
-    print(f"{len(trace)} images of {world.name} in {options.output}")
+    write(trace, options.output, f"{counted(len(trace), 'images')} of {world.name}")
     return 0

@@ -18,14 +18,18 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
         return f"unsatisfiable: no map satisfies the axioms; why was not found out in time ({solution.stopped})"
     why = f" ({solution.stopped})" if solution.stopped else ""
     seconds = f"{solution.seconds.total:.2f} s, {solution.prefix} of {solution.steps} steps given to clingo"
-    bound = ", ".join(f"at least {v} {k}" for k, v in solution.bound.to_dict().items())
+    bound = ", ".join(f"at least {counted(v, k)}" for k, v in solution.bound.to_dict().items())
     if solution.cost is None:
         return f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; any has {bound or 'no proven bound'}; {seconds}"
-    counts = ", ".join(f"{v} {k}" for k, v in solution.cost.to_dict().items())
+    counts = ", ".join(counted(v, k) for k, v in solution.cost.to_dict().items())
     if solution.status is Status.FEASIBLE:
         return f"feasible{why}: {counts}, not proven minimal; any map has {bound or 'no proven bound'}; {seconds}"
-    maps = "1 minimal map" if count == 1 else f"{count} minimal maps"
-    return f"optimal: {counts}; {maps}{'' if solution.complete else f', and there may be more{why}'}; {seconds}"
+    return f"optimal: {counts}; {counted(count, 'minimal maps')}{'' if solution.complete else f', and there may be more{why}'}; {seconds}"
+
+
+def counted(number: int, things: str) -> str:
+    """8 dstates, 1 dstate."""
+    return f"{number} {things.removesuffix('s') if number == 1 else things}"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from ssh_abduction.cli.options import Verbs, check_number, picture_file, seed
-from ssh_abduction.cli.text import table
+from ssh_abduction.cli.text import counted, table
 from ssh_abduction.errors import MapError
 from ssh_abduction.maps import maps_of, read_json
 from ssh_abduction.trace import Trace
@@ -65,7 +65,7 @@ def run_train(options: argparse.Namespace) -> int:
 
     images, labels = _labelled(options)
     save(recogniser().fit(images, labels), options.output)
-    print(f"{len(set(labels.tolist()))} dstates learnt from {len(images)} images in {options.output}")
+    print(f"{counted(len(set(labels.tolist())), 'dstates')} learnt from {counted(len(images), 'images')} in {options.output}")
     return 0
 
 
