@@ -9,7 +9,7 @@ from itertools import pairwise
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 
 from ssh_abduction import encodings
-from ssh_abduction.chart import FramedChart
+from ssh_abduction.chart import Chart, FramedChart
 from ssh_abduction.maps import DState, Path, SSHMap
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Trace
@@ -31,9 +31,13 @@ def theory_facts(theory: Theory, paths: int) -> str:
     """The axioms and the preference of a theory, and names for so many paths, as facts."""
     facts = [f"axiom({name})." for name in theory.axioms]
     facts += [f"path(1..{paths})."] if theory.level == "topological" else []
-    facts += [f"prefer({count},{len(theory.priorities) - i})." for i, count in enumerate(theory.priorities)]
+    facts += _preferred(theory)
     facts += ["defeasible."] if theory.boundary == "defeasible" else []
     return "\n".join(facts)
+
+
+def _preferred(theory: Theory) -> list[str]:
+    return [f"prefer({count},{len(theory.priorities) - i})." for i, count in enumerate(theory.priorities)]
 
 
 def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
@@ -331,6 +335,22 @@ def side_facts(theory: Theory) -> str:
     return "\n".join(facts)
 
 
+def way_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
+    """Which numbered actions are travels and turns, and which axioms of sides hold, as facts for ways.lp."""
+    kinds = [f"turns({a},{action.turn})." if action.turn else f"travels({a})." for a, action in actions.items()]
+    return "\n".join([*kinds, side_facts(theory)])
+
+
+def course_facts(
+    theory: Theory, dstates: Iterable[int], links: Iterable[tuple[int, int, int]], actions: Mapping[int, Action], *, single: bool = False
+) -> str:
+    """Dstates, the numbered actions that link them, and what is preferred, as facts for courses.lp; or for single courses."""
+    facts = [side_facts(theory), *(["total."] if theory.path_order == "total" else []), *(["single."] if single else [])]
+    facts += [f"is({x})." for x in dstates]
+    facts += [f"turn({s},{turn},{x})." if (turn := actions[a].turn) else f"travel({s},{x})." for s, a, x in links]
+    return "\n".join([*facts, *_preferred(theory)])
+
+
 def turn_facts(batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]) -> str:
     """New visits, and new turns on a visit, from slot to slot, as facts for sides.lp."""
     facts = [f"visit({batch},{visit})." for visit in visits]
@@ -354,8 +374,7 @@ def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nod
         visit, slot = chart.facing[node]
         star = chart.stars[visit]
         facts += [f"open({label},{k})." for k in range(4) if star[(slot + k) % 4]]
-    facts += [f"prefer({count},{len(theory.priorities) - i})." for i, count in enumerate(theory.priorities)]
-    return "\n".join(facts)
+    return "\n".join([*facts, *_preferred(theory)])
 
 
 def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int, int]]]:
@@ -383,10 +402,20 @@ def open_labels(labels: Sequence[int]) -> str:
     return "\n".join([*(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)), ":- not violated.", "#show is/2."])
 
 
-class StreetReader:
-    """Reads the maps of one labelling of nodes from answers of streets.lp; what the labels alone tell is worked out once."""
+def read_contraries(model: Model) -> list[int]:
+    """Dstates whose paths show that there are no places and paths for them."""
+    return sorted(args[0] for name, args in map(_atom, model.symbols(shown=True)) if name == "contrary")
 
-    def __init__(self, control: Control, trace: Trace, chart: FramedChart, labels: Sequence[int]) -> None:
+
+def forbidden_links(links: Iterable[tuple[int, int, int]]) -> str:
+    """The rule that these links of named dstates do not go together."""
+    return f":- {', '.join(f'goes({s},{a},{x})' for s, a, x in links)}."
+
+
+class StreetReader:
+    """Reads the maps of one labelling of nodes from answers of streets.lp or courses.lp; what the labels alone tell is worked out once."""
+
+    def __init__(self, control: Control, trace: Trace, chart: Chart, labels: Sequence[int]) -> None:
         stands, runs = (
             {args[0]: (args[1], args[2]) for _, args in (_atom(atom.symbol) for atom in control.symbolic_atoms.by_signature(name, 3))}
             for name in ("stands", "runs")

@@ -44,7 +44,7 @@ from ssh_abduction.annealing import annealed, annealed_steps
 from ssh_abduction.apart import apart_from, clique, far_apart
 from ssh_abduction.asking import POLL, Stopped, Watch, new_control
 from ssh_abduction.chart import Chart, Link, NoFrame, numbered
-from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found
+from ssh_abduction.engine import AT_ONCE, ChartedEngine, Engine, Found
 from ssh_abduction.merging import merged, merged_near, thinned
 from ssh_abduction.nearby import AT_A_TIME, SECONDS_A_CHARACTER, Beside, NearbySearch, mended
 from ssh_abduction.replay import Log
@@ -64,7 +64,7 @@ TRIES = 3  # how often a map near a guess is sought with more conflicts, where n
 _Trail: TypeAlias = "tuple[Link, _Trail] | None"
 
 
-class _Settled(Exception):  # noqa: N818 - not an error
+class Settled(Exception):  # noqa: N818 - not an error
     """A map is known that has as few dstates as the bound."""
 
 
@@ -86,7 +86,7 @@ class NamedEngine(ChartedEngine):
         self._known: list[int] | None = None  # labels of a map from there
         self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
 
-    def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
+    def over(self, trace: Trace, watch: Watch, log: Log) -> Engine:
         return NamedEngine(trace, self._theory, watch, log, self._speedups)
 
     def grow(self, size: int) -> None:
@@ -112,7 +112,7 @@ class NamedEngine(ChartedEngine):
         self._far = far_apart(apart, seen, self._log.actions[: size - 1]) if self._speedups.apart and len(seen) <= AT_ONCE else None
         self._one_by_one = self._hard = False
         self._known = None
-        self._spares = dict.fromkeys(seen, SPARES)
+        self._spares = self._first_spares()
         self._links = dict.fromkeys(self._chart.links)
         if self._speedups.lazy:
             first = {0, *self.clique}
@@ -120,6 +120,10 @@ class NamedEngine(ChartedEngine):
         self.bound = max(self.bound or 0, len(self.clique))
         self.ground_seconds += time.perf_counter() - began
         self._restart()
+
+    def _first_spares(self) -> dict[int, int]:
+        """How many spare names each view has, to begin with."""
+        return dict.fromkeys(self._chart.seen, SPARES)
 
     def _columns(self, nodes: Sequence[int]) -> NDArray[np.bool_]:
         """The columns of these nodes in the matrix of apart nodes, where that is too large."""
@@ -140,7 +144,7 @@ class NamedEngine(ChartedEngine):
             return
         try:
             yield from self._searched()
-        except _Settled:
+        except Settled:
             self._end_beside()
             yield self._known or []
         except (Stopped, KeyboardInterrupt):
@@ -152,7 +156,7 @@ class NamedEngine(ChartedEngine):
             self._end_beside()
 
     def _searched(self) -> Iterator[list[int]]:
-        """The same, from this search alone. Raises _Settled where the one beside it has fewest dstates."""
+        """The same, from this search alone. Raises Settled where the one beside it has fewest dstates."""
         while not self._one_by_one:
             lazy = len(self._links) < len(self._chart.links)
             answer = None
@@ -178,11 +182,24 @@ class NamedEngine(ChartedEngine):
             elif not self._named_more(answer):
                 self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
                 labels, failed = self._follow(answer)
-                if not failed:
+                if failed:
+                    self._add(failed)
+                elif self._fits(labels):
                     yield labels
                     return
-                self._add(failed)
-        yield self._follow(self._first_of_bound())[0]
+                else:
+                    self._forbid(labels)
+        while not self._fits(labels := self._follow(self._first_of_bound())[0]):
+            self._forbid(labels)
+        yield labels
+
+    def _fits(self, labels: Sequence[int]) -> bool:
+        """Whether these labels, which all links hold of, are those of a map. For theories that ask for more than the causal one."""
+        return True
+
+    def _forbid(self, labels: Sequence[int]) -> None:
+        """Tell clingo why these labels, which do not fit, are not those of a map."""
+        raise NotImplementedError
 
     def _search_nearby(self) -> Iterator[list[int]]:
         """Begin to search for small maps in another thread; where there is but one processor, give a map merged by evidence."""
@@ -199,7 +216,7 @@ class NamedEngine(ChartedEngine):
             yield labels
 
     def _search_alone(self) -> Iterator[list[int]]:
-        """Search for small maps near a guess for a while, with nothing beside it. Raises _Settled where one has fewest dstates."""
+        """Search for small maps near a guess for a while, with nothing beside it. Raises Settled where one has fewest dstates."""
         if len(self._chart.seen) > AT_ONCE:
             return
         search = self._nearby(self._watch)
@@ -208,7 +225,7 @@ class NamedEngine(ChartedEngine):
             yield labels
         if search.bound:
             self._heed(self._known, search.bound)
-            raise _Settled
+            raise Settled
 
     def _nearby(self, watch: Watch) -> NearbySearch:
         return NearbySearch(
@@ -253,12 +270,12 @@ class NamedEngine(ChartedEngine):
         return guess
 
     def _settled(self) -> bool:
-        """Never. Raises _Settled where the search beside this one has as few dstates as the bound."""
+        """Never. Raises Settled where the search beside this one has as few dstates as the bound."""
         if self._beside is not None:
             self._beside.check()
             self._heed(self._beside.labels, self._beside.bound)
             if self._known and len(set(self._known)) <= (self.bound or 0):
-                raise _Settled
+                raise Settled
         return False
 
     def _check_ahead(self, seconds: float) -> None:
@@ -328,7 +345,7 @@ class NamedEngine(ChartedEngine):
             self._begun.close()
             self._begun = None
 
-    def _labels_of(self, dstates: int, enough: int) -> Iterator[list[int]]:
+    def _labels_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
         """All ways to name the nodes with so many dstates; or `enough` of them, unless that is 0. One that is known comes first."""
         known = self._known if self._known and len(set(self._known)) == dstates else None
         if known:

@@ -25,7 +25,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Self, TypeAlias
+from typing import Self, TypeAlias, TypeVar
 
 import clingo
 import numpy as np
@@ -50,6 +50,7 @@ FAR = 200  # failures to be transitive after which an answer is not nearby
 
 Pair: TypeAlias = tuple[int, int, int]  # visits I < J, R: slot 0 of I is slot R of J
 Three: TypeAlias = tuple[int, int, int, int, int]  # visits I < J < K, and how I is turned to J, and J to K
+Member = TypeVar("Member")
 _Turned: TypeAlias = dict[int, dict[int, int]]  # of visits that are the same: which slot of the other slot 0 is
 
 
@@ -426,7 +427,7 @@ def _states(chart: FramedChart, labels: Sequence[int]) -> list[int]:
     return [states[visit] for visit in range(len(states))]
 
 
-def smaller(members: list[int], shrunk: Callable[[list[int]], list[int] | None], tries: int | None = None) -> list[int]:
+def smaller(members: list[Member], shrunk: Callable[[list[Member]], list[Member] | None], tries: int | None = None) -> list[Member]:
     """Fewer members that still have what all of them have: parts are left out, half of them first, single members last.
 
     shrunk  of some members those that have it, if they do

@@ -404,8 +404,9 @@ class Search:
             self.bound = replace(self.bound, dstates=max(len(self._apart.certificate.clique), self.bound.dstates or 0))
 
     def _find_cost_or_pause(self) -> bool:
-        """The same as _find_cost; where that takes long, seek a map with frames first, and go on from there."""
-        if self._may_frame():
+        """The same as _find_cost; where that takes long, seek a map with frames first, and go on from there, with names for dstates."""
+        may_frame, may_name = self._may_frame(), self._may_name()
+        if may_frame or may_name:
             self._watch.pause_after(min(FRAME_AFTER, FRAMING_SHARE * self._watch.left()))
             try:
                 return self._find_cost()
@@ -413,14 +414,24 @@ class Search:
                 pass
             finally:
                 self._watch.pause_after(math.inf)
-            self._frame()
             self._start = max(self._start, self.prefix)
+            if may_frame:
+                self._frame()
+            if may_name:
+                self._name_dstates()
         return self._find_cost()
 
     def _may_frame(self) -> bool:
-        """Whether a map in which places have frames is worth seeking, and the trace not too long for that. While a robot drives there are sketches."""
-        known = self._speedups.framing and isinstance(self._engine, StepEngine) and self.theory.with_frames() is not None
-        return known and not self._goes_on and FEW_STEPS < len(self.trace) <= AT_ONCE
+        """Whether a map in which places have frames is worth seeking. While a robot drives there are sketches."""
+        return self._speedups.framing and self._may_take_all() and self.theory.with_frames() is not None
+
+    def _may_name(self) -> bool:
+        """Whether dstates can be settled first, with names, though places have no frames."""
+        return self._speedups.ways and self._speedups.names and self._may_take_all() and self.theory.has_bare_places
+
+    def _may_take_all(self) -> bool:
+        """Whether something else than step by step is worth it, and the trace not too long for all of it at once."""
+        return isinstance(self._engine, StepEngine) and not self._goes_on and FEW_STEPS < len(self.trace) <= AT_ONCE
 
     def _frame(self) -> None:
         """Seek maps in which places have frames."""
@@ -435,6 +446,16 @@ class Search:
                     self._report()
         except Stopped:
             self._watch.check()
+
+    def _name_dstates(self) -> None:
+        """Go on with the engine that settles dstates first, if the trace is known to have some map."""
+        if self.best is None:
+            self._sketch()
+        if self.best is not None:
+            from ssh_abduction.ways import WaysEngine
+
+            self._engine = WaysEngine(self.trace, self.theory, self._watch, self._log, self._speedups, self.best.labels)
+            self._start = len(self.trace)
 
     def _find_cost(self) -> bool:
         """Extend the prefix until a minimal map of it replays to the end. False where the prefix has no map."""

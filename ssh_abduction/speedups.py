@@ -24,6 +24,7 @@ class Speedups:
     sides        with frames: say what order and sides forbid while dstates are sought, street by street
     annealed     with names or frames: where clingo takes its time, a map near a guess, so that a small one is known
     framing      full theory where places need have no frames: where clingo takes its time, seek a map in which they have, so that a small one is known
+    ways         full theory without stars: where clingo takes its time, settle dstates before places and paths, with names
     watched      with names or frames: make constraints of three literals longer, so that clasp watches two of them rather than all three
     one_by_one   with names: where that stalls, ask for numbers of dstates one by one
     threads      with names or frames: two threads, where a trace is hard and there are two processors
@@ -42,6 +43,7 @@ class Speedups:
     sides: bool = True
     annealed: bool = True
     framing: bool = True
+    ways: bool = True
     watched: bool = True
     one_by_one: bool = True
     threads: bool = True

@@ -135,6 +135,17 @@ class Theory:
             and not (self.next_place or self.all_on_paths or self.without)
         )
 
+    @property
+    def has_bare_places(self) -> bool:
+        """Whether places have no frames, no stars either, and ways.py knows the axioms and the preference."""
+        return (
+            self.level == "topological"
+            and self.star == "none"
+            and self.priorities[:1] == ("dstates",)
+            and self.boundary in ("none", "strict")
+            and not (self.next_place or self.all_on_paths or self.without)
+        )
+
     def with_frames(self) -> Theory | None:
         """A theory in which places have frames and fewest dstates come first, and whose maps, but for their headings, are maps of this one.
 

@@ -1,0 +1,110 @@
+"""The full theory where places have no frames: dstates settled before places and paths, against the plain encoding, and in mazes."""
+
+from __future__ import annotations
+
+from unittest.mock import patch
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from instances import maze
+from strategies import traces
+
+from ssh_abduction import Search, Speedups, Status, Theory, named, solve, solver, ways
+from ssh_abduction.asking import Watch
+from ssh_abduction.checker import check
+from ssh_abduction.proof import check_bound
+from ssh_abduction.replay import Log
+from ssh_abduction.speedups import SPEEDUPS
+from ssh_abduction.ways import WaysEngine
+
+PLAIN = Speedups.without(SPEEDUPS)
+
+
+@st.composite
+def bare_theories(draw: st.DrawFn) -> Theory:
+    """Theories in which places have no frames, and fewest dstates come first."""
+    return Theory(
+        boundary=draw(st.sampled_from(["none", "strict"])),
+        symmetric_sides=draw(st.booleans()),
+        path_order=draw(st.sampled_from(["partial", "total"])),
+        star="none",
+        prefer=draw(st.sampled_from([("dstates",), ("dstates", "paths"), ("dstates", "places", "paths"), ("dstates", "paths", "places")])),
+    )
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.data())
+def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
+    """Told of paths that an answer contradicts, or only of links that do not go together; with few names at first; a minimal map known, or none."""
+    trace = data.draw(traces(max_steps=8), label="trace").without_stars()
+    theory = data.draw(bare_theories(), label="theory")
+    contrary = data.draw(st.sampled_from([0, 1, ways.CONTRARY]), label="contrary")
+    spares = data.draw(st.sampled_from([0, 2]), label="spare names")
+    patience = data.draw(st.sampled_from([0, named.PATIENCE]), label="patience")
+    cores = data.draw(st.sampled_from([0, named.CORES]), label="cores")
+    expected = solve(trace, theory, maps=0, speedups=PLAIN)
+    if not expected.cost:
+        return  # the engine is asked only where some map is known
+    with patch.multiple(named, SPARES=spares, PATIENCE=patience, CORES=cores), patch.object(ways, "CONTRARY", contrary):
+        known = list(range(len(trace))) if data.draw(st.booleans(), label="some map") else expected.maps[0].labels
+        engine = WaysEngine(trace, theory, Watch(), Log(trace, theory), Speedups(), known)
+        engine.grow(len(trace))
+        *_, best = engine.improving_maps()
+        found = [found.map for found in engine.maps_of_cost(best.cost, 0)]
+    assert set(found) == set(expected.maps)
+    assert len(found) == len(expected.maps)
+    assert best.cost == expected.cost.preferred_by(theory)
+    assert engine.bound == best.cost[0]
+
+
+@pytest.mark.parametrize("off", ["", "clique", "apart", "lazy", "core_guided", "one_by_one", "threads", "framing", "watched"])
+def test_a_maze_without_stars(off: str) -> None:
+    """All minimal maps of forty steps, by whatever helps; the bound has a certificate."""
+    trace = maze(2, 2, steps=40, seed=1).trace
+    with patch.object(solver, "FRAME_AFTER", -1.0):
+        search = Search(trace, maps=0, speedups=Speedups.without(off))
+        found = search.solution(tuple(search))
+    expected = solve(trace, maps=0, speedups=Speedups.without("ways"))
+    assert isinstance(search._engine, WaysEngine)
+    assert set(found.maps) == set(expected.maps)
+    assert found.complete
+    assert found.certificate
+    bound = check_bound(trace, found.certificate.to_dict(trace))
+    assert bound.faults == ()
+    assert found.cost
+    assert bound.dstates + len(bound.refuted) == found.cost.dstates
+
+
+def test_few_of_many_maps() -> None:
+    trace = maze(2, 2, steps=120, seed=2).trace
+    with patch.object(solver, "FRAME_AFTER", -1.0):
+        few, every = solve(trace, maps=3), solve(trace, maps=0)
+    assert (few.status, few.count, few.complete, few.stopped) == (Status.OPTIMAL, 3, False, "maps limit")
+    assert every.complete
+    assert set(few.maps) < set(every.maps)
+    assert all(check(trace, ssh_map, every.theory) == () for ssh_map in every.maps)
+
+
+@pytest.mark.parametrize("name", ["_restart", "_fits", "_courses"])
+def test_what_ends_it_leaves_the_map_with_frames(name: str) -> None:
+    """Whatever it is at: the map that was known before is the answer."""
+    trace = maze(2, 2, steps=120, seed=1).trace
+    with patch.object(solver, "FRAME_AFTER", -1.0), patch.object(WaysEngine, name, side_effect=KeyboardInterrupt):
+        found = solve(trace)
+    assert (found.status, found.stopped, found.count) == (Status.FEASIBLE, "interrupted", 1)
+    assert check(trace, found.maps[0], found.theory) == ()
+
+
+def test_a_robot_that_goes_on_where_that_ended() -> None:
+    """The first search of a mapper may be of many steps; what it proved holds for the steps that come."""
+    trace = maze(2, 2, steps=36, seed=1).trace
+    first = trace.prefix(32)
+    with patch.object(solver, "FRAME_AFTER", -1.0):
+        search = Search(first, maps=0)
+        before = search.solution(tuple(search))
+        assert isinstance(search._engine, WaysEngine)
+        after = Search(trace, maps=0, after=search)
+        found = after.solution(tuple(after))
+    assert before.complete
+    assert set(found.maps) == set(solve(trace, maps=0, speedups=Speedups.without("ways")).maps)
