@@ -27,7 +27,7 @@ FULL = ["full rectangle n=400", "full aces3", BARE.name]
 FRAMED = ["full taylor-hall", SMALL.name, "full maze 5x5 n=1600", "full maze 10x10 n=200"]
 USED = {
     "causal": {"prefixes", "names", "clique", "apart", "lazy", "core_guided", "annealed", "watched", "one_by_one", "threads", "greedy"},
-    "full": {"prefixes", "path_names", "from_below", "framing"},
+    "full": {"prefixes", "path_names", "from_below", "framing", "ways"},
     "framed": {"prefixes", "names", "clique", "core_guided", "small_cores", "sides", "annealed", "watched", "threads"},
 }
 

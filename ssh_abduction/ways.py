@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from itertools import chain
+from typing import TypeAlias
 
 import clingo
 
@@ -39,6 +40,8 @@ from ssh_abduction.trace import Trace
 CONTRARY = 8  # paths that clingo is told of in one go
 BETTERING = 20_000  # conflicts after which better courses are no longer sought one after another
 
+_Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...]]  # labels of all steps, and options of clasp
+
 
 class WaysEngine(NamedEngine):
     """The full theory without frames, fewest dstates first, for a trace of which some map is known.
@@ -55,9 +58,7 @@ class WaysEngine(NamedEngine):
         self._actions = dict(zip(log.actions, trace.actions, strict=True))
         self._forbidden = 0  # sets of links, so far
         self._ways: set[int] | None = None  # dstates of whose paths clingo was told; None before it was of any
-        self._asked: tuple[tuple[tuple[int, ...], tuple[str, ...]], clingo.Control] | None = (
-            None  # labels and options, and the control for them
-        )
+        self._asked: tuple[_Question, clingo.Control] | None = None  # the last labels, and the control for their places and paths
         self._best: tuple[tuple[int, ...], list[list[int]]] | None = None  # the minimal cost, and all labels that have it
 
     def over(self, trace: Trace, watch: Watch, log: Log) -> StepEngine:
@@ -80,7 +81,7 @@ class WaysEngine(NamedEngine):
 
     def _settled(self) -> bool:
         """Never. Raises Settled where the known map has as few dstates as the bound."""
-        if self._known and self.bound == len(set(self._known)):
+        if self._known and (self.bound or 0) >= len(set(self._known)):
             raise Settled
         return False
 
@@ -159,10 +160,9 @@ class WaysEngine(NamedEngine):
             self._control.add("ways", [], facts.way_facts(self._theory, self._actions))
             parts.append(("ways", []))
         new = [name for name in names if name not in self._ways]
+        parts += [("way", facts.numbers(name)) for name in new]
         self._end_begun()
-        self._control.ground(
-            [*parts, *(("way", facts.numbers(name)) for name in new)]
-        )  # in one go: that takes half as long, and searching, too
+        self._control.ground(parts)  # in one go: that takes half as long, and searching, too
         self._ways.update(new)
         self.ground_seconds += time.perf_counter() - began
         return bool(new)
@@ -175,7 +175,7 @@ class WaysEngine(NamedEngine):
         control = self._courses(links)
         control.ground([("base", [])])
         contrary = next(self._answers(facts.read_contraries, "ignore", 1, control=control))
-        if contrary and self._tell_of([*sorted(contrary, key=lambda name: name in (self._ways or ()))][:CONTRARY]):
+        if contrary and self._tell_of([name for name in contrary if name not in (self._ways or ())][:CONTRARY]):
             return
         rule = facts.forbidden_links(smaller(links, self._clashing))
         self._end_begun()
