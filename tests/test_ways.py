@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from unittest.mock import patch
 
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import traces
 
-from ssh_abduction import Search, Speedups, Status, Theory, named, solve, solver, ways
+from ssh_abduction import Search, Speedups, Status, Theory, Trace, named, solve, solver, ways
 from ssh_abduction.asking import Watch
 from ssh_abduction.checker import check
 from ssh_abduction.proof import check_bound
@@ -18,6 +19,7 @@ from ssh_abduction.replay import Log
 from ssh_abduction.speedups import SPEEDUPS
 from ssh_abduction.ways import WaysEngine
 
+EXAMPLES = Path(__file__).parent.parent / "examples"
 PLAIN = Speedups.without(SPEEDUPS)
 
 
@@ -74,6 +76,18 @@ def test_a_maze_without_stars(off: str) -> None:
     assert bound.faults == ()
     assert found.cost
     assert bound.dstates + len(bound.refuted) == found.cost.dstates
+
+
+def test_the_route_of_a_robot() -> None:
+    """As the table of docs/theory.md has it: (19, 9, 4), 38 maps."""
+    trace = Trace.load(EXAMPLES / "aces3-route.jsonl")
+    with patch.multiple(solver, FRAME_AFTER=-1.0, FEW_STEPS=0):
+        search = Search(trace, Theory(star="none"), maps=0)
+        found = search.solution(tuple(search))
+    assert isinstance(search._engine, WaysEngine)
+    assert found.cost
+    assert found.cost.to_dict() == {"dstates": 19, "places": 9, "paths": 4}
+    assert len(set(found.maps)) == found.count == 38
 
 
 def test_few_of_many_maps() -> None:
