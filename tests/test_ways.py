@@ -35,7 +35,7 @@ def bare_theories(draw: st.DrawFn) -> Theory:
     )
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(st.data())
 def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
     """Told of paths that an answer contradicts, or only of links that do not go together; with few names at first; a minimal map known, or none."""
@@ -60,7 +60,7 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
     assert engine.bound == best.cost[0]
 
 
-@pytest.mark.parametrize("off", ["", "clique", "apart", "lazy", "core_guided", "one_by_one", "threads", "framing", "watched"])
+@pytest.mark.parametrize("off", ["", "clique", "lazy", "core_guided", "framing"])
 def test_a_maze_without_stars(off: str) -> None:
     """All minimal maps of forty steps, by whatever helps; the bound has a certificate."""
     trace = maze(2, 2, steps=40, seed=1).trace
