@@ -23,11 +23,38 @@ AT_ONCE = 8000  # steps that are compared in pairs; the matrix has the square of
 
 
 @dataclass(frozen=True, slots=True)
+class Cost:
+    """How many dstates, places, paths and excused pairs of paths a map has."""
+
+    dstates: int
+    places: int
+    paths: int
+    excuses: int = 0
+
+    @staticmethod
+    def of(ssh_map: SSHMap) -> Cost:
+        return Cost(len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.excused))
+
+    def preferred_by(self, theory: Theory) -> tuple[int, ...]:
+        """The counts that a theory prefers, first to last."""
+        return tuple(getattr(self, name) for name in theory.priorities)
+
+    def to_dict(self) -> dict[str, int]:
+        counts = {"dstates": self.dstates, "places": self.places, "paths": self.paths}
+        return {**counts, "excuses": self.excuses} if self.excuses else counts
+
+
+@dataclass(frozen=True, slots=True)
 class Found:
     """A map of a prefix, and what it costs: the preferred counts, first to last."""
 
     map: SSHMap
     cost: tuple[int, ...]
+
+    @staticmethod
+    def of(ssh_map: SSHMap, theory: Theory) -> Found:
+        """A map and its counts, which it shows, as no axiom is left out."""
+        return Found(ssh_map, Cost.of(ssh_map).preferred_by(theory))
 
 
 class Engine(Asker):
@@ -37,9 +64,11 @@ class Engine(Asker):
     clique  nodes that are pairwise apart (chart.py), if it needs to know some; in the causal theory they are steps
     intact  False after an error that may have left the control half told
     lists_least  whether maps_of_cost lists maps with the fewest dstates of the prefix alone
+    goes_on  whether it can go on with a trace that its own has grown to
     """
 
     lists_least = False
+    goes_on = True
 
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, paths: int = 0) -> None:
         super().__init__(watch)

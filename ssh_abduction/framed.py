@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import chain, combinations
+from itertools import chain, combinations, islice
 
 import clingo
 
@@ -258,13 +258,9 @@ class FramedEngine(SameEngine):
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         if not self._framed:
             return
-        count = 0
-        for naming in self._best[1] if self._best and self._best[0] == cost else self._fitting(cost[0]):
-            for found in self._maps(naming, f"enum,{','.join(map(str, (0, *cost[1:])))}"):
-                yield found
-                count += 1
-                if count == enough:
-                    return
+        namings = self._best[1] if self._best and self._best[0] == cost else self._fitting(cost[0])
+        mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
+        yield from islice((found for naming in namings for found in self._maps(naming, mode)), enough or None)
 
     def _fitting(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[_Naming]:
         """All ways to be at so many dstates that have streets, each once, and not that one."""
@@ -323,9 +319,7 @@ class FramedEngine(SameEngine):
         read_map = facts.StreetReader(control, self._trace, self._chart, naming.labels)
 
         def read(model: clingo.Model) -> Found:
-            found = read_map(model)
-            counts = {"dstates": len(found.dstates), "places": len(found.places), "paths": len(found.paths)}
-            return Found(found, tuple(counts[preferred] for preferred in self._theory.priorities))
+            return Found.of(read_map(model), self._theory)
 
         return (yield from self._answers(read, mode, int(mode == "ignore"), control=control, conflicts=conflicts))
 

@@ -44,7 +44,7 @@ from ssh_abduction.annealing import annealed, annealed_steps
 from ssh_abduction.apart import apart_from, clique, far_apart
 from ssh_abduction.asking import POLL, Stopped, Watch, new_control
 from ssh_abduction.chart import Chart, Link, NoFrame, numbered
-from ssh_abduction.engine import AT_ONCE, ChartedEngine, Engine, Found
+from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found
 from ssh_abduction.merging import merged, merged_near, thinned
 from ssh_abduction.nearby import AT_A_TIME, SECONDS_A_CHARACTER, Beside, NearbySearch, mended
 from ssh_abduction.replay import Log
@@ -86,7 +86,7 @@ class NamedEngine(ChartedEngine):
         self._known: list[int] | None = None  # labels of a map from there
         self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
 
-    def over(self, trace: Trace, watch: Watch, log: Log) -> Engine:
+    def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
         return NamedEngine(trace, self._theory, watch, log, self._speedups)
 
     def grow(self, size: int) -> None:
@@ -407,8 +407,7 @@ class NamedEngine(ChartedEngine):
         self.bound = max(self.bound or 0, len(self.clique) + costs[0])
 
     def _found(self, labels: Sequence[int]) -> Found:
-        found = facts.causal_map(labels, self._trace)
-        return Found(found, (len(found.dstates),))
+        return Found.of(facts.causal_map(labels, self._trace), self._theory)
 
     def _restart(self) -> None:
         """Take a new control, for other names."""

@@ -44,12 +44,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.checker import check
-from ssh_abduction.engine import AT_ONCE
+from ssh_abduction.engine import AT_ONCE, Cost
 from ssh_abduction.errors import TraceError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.replay import Outcome, observation
 from ssh_abduction.sketch import Sketch
-from ssh_abduction.solver import ALL, Cost, Search, Seconds, Solution, Status
+from ssh_abduction.solver import ALL, Search, Seconds, Solution, Status
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Step, Trace, View

@@ -50,7 +50,7 @@ from enum import Enum
 from ssh_abduction import facts
 from ssh_abduction.asking import Grounding, Paused, Stop, Stopped, Watch
 from ssh_abduction.certificate import RESTS_ON, Certificate, Evidence
-from ssh_abduction.engine import AT_ONCE, Engine, Found, StepEngine
+from ssh_abduction.engine import AT_ONCE, Cost, Engine, Found, StepEngine
 from ssh_abduction.errors import SolverError, TheoryError, TraceError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.replay import Log, Outcome
@@ -76,28 +76,6 @@ class Status(Enum):
     FEASIBLE = "feasible"  # a map of the whole trace and a bound, but no proof that it is minimal
     UNSATISFIABLE = "unsatisfiable"  # no map satisfies the axioms, proven
     UNKNOWN = "unknown"  # stopped before any map of the whole trace was found
-
-
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """How many dstates, places, paths and excused pairs of paths a map has."""
-
-    dstates: int
-    places: int
-    paths: int
-    excuses: int = 0
-
-    @staticmethod
-    def of(ssh_map: SSHMap) -> Cost:
-        return Cost(len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.excused))
-
-    def preferred_by(self, theory: Theory) -> tuple[int, ...]:
-        """The counts that a theory prefers, first to last."""
-        return tuple(getattr(self, name) for name in theory.priorities)
-
-    def to_dict(self) -> dict[str, int]:
-        counts = {"dstates": self.dstates, "places": self.places, "paths": self.paths}
-        return {**counts, "excuses": self.excuses} if self.excuses else counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,7 +246,7 @@ class Search:
             self._engine = self._new_engine()
             return
         self._watch.use_reserve()
-        outgrown = isinstance(after._engine, StepEngine) and self._names_pay()
+        outgrown = not after._engine.goes_on or (isinstance(after._engine, StepEngine) and self._names_pay())
         self._engine = self._new_engine() if outgrown else after._engine.over(trace, self._watch, self._log)
         if after.stopped == "interrupted" or not self._engine.intact:  # perhaps while a step was grounded
             self._engine = self._engine.with_paths(self._engine.paths)
@@ -439,10 +417,10 @@ class Search:
 
         seconds = min(FRAMING, FRAMING_SHARE * self._watch.left())
         try:
-            for found in maps_with_frames(self.trace, self.theory, self._watch.part(seconds), self._speedups):
-                cost = Cost.of(found).preferred_by(self.theory)
-                if self.best is None or cost < self._cost:
-                    self._keep(Found(found, cost), found.labels)
+            for ssh_map in maps_with_frames(self.trace, self.theory, self._watch.part(seconds), self._speedups):
+                found = Found.of(ssh_map, self.theory)
+                if self.best is None or found.cost < self._cost:
+                    self._keep(found, ssh_map.labels)
                     self._report()
         except Stopped:
             self._watch.check()
@@ -492,7 +470,7 @@ class Search:
         theory = self.theory
         if self._speedups.greedy and theory.level == "causal" and not theory.without:
             found = facts.causal_map(self._log.merged(), self.trace)
-            self._keep(Found(found, (len(found.dstates),) if theory.prefer else ()), found.labels)
+            self._keep(Found.of(found, theory), found.labels)
 
     def _sketch(self) -> None:
         """Where nothing was found in time: some map of the whole trace, made without a search."""
@@ -505,7 +483,7 @@ class Search:
         for sketch in Sketch.all_of(first, self.theory):
             if all(sketch.extend(action, step) for action, step in zip(self.trace.actions, rest, strict=True)):
                 found = sketch.map()
-                self._keep(Found(found, Cost.of(found).preferred_by(self.theory)), found.labels)
+                self._keep(Found.of(found, self.theory), found.labels)
                 return
 
     def _minimise(self) -> Found | None:

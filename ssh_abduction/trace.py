@@ -319,6 +319,15 @@ def _parse(file: BinaryIO, source: str) -> Trace:
     return Trace(tuple(steps), name=header.get("name"), images=header.get("images"), extra=extra, source=source)
 
 
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in fields if names.count(name) > 1)
+        raise ValueError(f"the field {brief(twice)} twice; keep one of them")
+    return fields
+
+
 def _record(raw: bytes, where: str) -> dict[str, Any]:
     found: list[str] = []
 
@@ -331,19 +340,11 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
             raise ValueError("a number of more than 100 digits; shorten it")
         return int(text)
 
-    def object_of(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        fields = dict(pairs)
-        if len(fields) < len(pairs):
-            names = [name for name, _ in pairs]
-            twice = next(name for name in fields if names.count(name) > 1)
-            raise ValueError(f"the field {brief(twice)} twice; keep one of them")
-        return fields
-
     if b"\0" in raw:
         raise TraceError(f"{where}: line: expected text in UTF-8, got a null byte at column {raw.index(0) + 1}; is this a binary file?")
     try:
         text = raw.rstrip().decode("utf-8-sig" if where.endswith(":1") else "utf-8")
-        record = json.loads(text, object_pairs_hook=object_of, parse_constant=constant, parse_int=integer)
+        record = json.loads(text, object_pairs_hook=_object, parse_constant=constant, parse_int=integer)
     except UnicodeDecodeError as error:
         raise TraceError(
             f"{where}: line: expected text in UTF-8, got the byte 0x{raw[error.start]:02x} at column {error.start + 1}; is this a binary file?"

@@ -19,9 +19,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
-from itertools import chain
+from itertools import chain, islice
 from typing import TypeAlias
 
 import clingo
@@ -29,7 +29,7 @@ import clingo
 from ssh_abduction import encodings, facts
 from ssh_abduction.asking import Watch
 from ssh_abduction.chart import Link, numbered
-from ssh_abduction.engine import Found, StepEngine
+from ssh_abduction.engine import Found
 from ssh_abduction.named import NamedEngine, Settled
 from ssh_abduction.replay import Log
 from ssh_abduction.same import smaller
@@ -50,6 +50,7 @@ class WaysEngine(NamedEngine):
     """
 
     lists_least = True
+    goes_on = False  # of the longer trace no map is known
 
     def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups, known: Sequence[int]) -> None:
         super().__init__(trace, theory, watch, log, speedups)
@@ -57,18 +58,14 @@ class WaysEngine(NamedEngine):
         self.paths = len(trace)  # names for paths are never short
         self._actions = dict(zip(log.actions, trace.actions, strict=True))
         self._forbidden = 0  # sets of links, so far
-        self._ways: set[int] | None = None  # dstates of whose paths clingo was told; None before it was of any
+        self._ways: set[int] = set()  # dstates of whose paths clingo was told
         self._asked: tuple[_Question, clingo.Control] | None = None  # the last labels, and the control for their places and paths
         self._best: tuple[tuple[int, ...], list[list[int]]] | None = None  # the minimal cost, and all labels that have it
-
-    def over(self, trace: Trace, watch: Watch, log: Log) -> StepEngine:
-        """For the longer trace no map is known."""
-        return StepEngine(trace, self._theory, watch, facts.most_paths(trace, self._theory, len(trace)))
 
     def grow(self, size: int) -> None:
         if size == self.size:
             return
-        self._best = self._ways = None
+        self._best, self._ways = None, set()
         super().grow(size)
         self._known = numbered(self._given_map[:size])
 
@@ -103,13 +100,9 @@ class WaysEngine(NamedEngine):
         self._best = best.cost, named
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        count = 0
-        for labels in self._best[1] if self._best and self._best[0] == cost else self._fitting(cost[0]):
-            for found in self._maps(labels, f"enum,{','.join(map(str, (0, *cost[1:])))}"):
-                yield found
-                count += 1
-                if count == enough:
-                    return
+        every = self._best[1] if self._best and self._best[0] == cost else self._fitting(cost[0])
+        mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
+        yield from islice((found for labels in every for found in self._maps(labels, mode)), enough or None)
 
     def _fitting(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[list[int]]:
         """All ways to be at so many dstates that have places and paths, each once, and not that one."""
@@ -137,45 +130,43 @@ class WaysEngine(NamedEngine):
 
     def _restart(self) -> None:
         """Take a new control, for other names, and tell it of the same paths."""
-        if self._ways is None:
-            super()._restart()
-            return
-        names, ways = self._names(), self._ways
-        self._ways = None
+        told = {key for key, name in self._names().items() if name in self._ways} if self._ways else ()
+        self._ways = set()
         super()._restart()
-        self._tell_of(name for key, name in self._names().items() if names.get(key) in ways)
+        if told:
+            self._tell_of([name for key, name in self._names().items() if key in told])
 
     def _names(self) -> dict[tuple[int, int], int]:
         """The names of dstates, but for rests, by what they are whatever the number of spare names."""
         pinned = {(-1, name): name for name in range(len(self.clique))}
         return pinned | {(view, i): name for view, spare in self._spare.items() for i, name in enumerate(spare[:-1])}
 
-    def _tell_of(self, names: Iterable[int]) -> bool:
-        """Tell clingo what the paths of these dstates demand. Returns whether there are any that it did not know of."""
+    def _tell_of(self, names: Collection[int]) -> None:
+        """Tell clingo what the paths of these dstates demand, of which it does not know yet."""
         began = time.perf_counter()
         parts: list[tuple[str, list[clingo.Symbol]]] = []
-        if self._ways is None:
-            self._ways = set()
+        if not self._ways:
             self._control.load(encodings.path("ways"))
             self._control.add("ways", [], facts.way_facts(self._theory, self._actions))
             parts.append(("ways", []))
-        new = [name for name in names if name not in self._ways]
-        parts += [("way", facts.numbers(name)) for name in new]
+        parts += [("way", facts.numbers(name)) for name in names]
         self._end_begun()
         self._control.ground(parts)  # in one go: that takes half as long, and searching, too
-        self._ways.update(new)
+        self._ways.update(names)
         self.ground_seconds += time.perf_counter() - began
-        return bool(new)
 
     def _fits(self, labels: Sequence[int]) -> bool:
-        return next(self._maps(labels, "ignore"), None) is not None
+        return self._has_courses(self._least_courses(labels))
+
+    def _has_courses(self, control: clingo.Control) -> bool:
+        return next(self._answers(lambda _: True, "ignore", 1, control=control), False)
 
     def _forbid(self, labels: Sequence[int]) -> None:
         links = self._links_of(labels)
-        control = self._courses(links)
-        control.ground([("base", [])])
+        control = self._courses(links, parts=("base",))
         contrary = next(self._answers(facts.read_contraries, "ignore", 1, control=control))
-        if contrary and self._tell_of([name for name in contrary if name not in (self._ways or ())][:CONTRARY]):
+        if new := [name for name in contrary if name not in self._ways][:CONTRARY]:
+            self._tell_of(new)
             return
         rule = facts.forbidden_links(smaller(links, self._clashing))
         self._end_begun()
@@ -185,26 +176,29 @@ class WaysEngine(NamedEngine):
 
     def _clashing(self, links: list[Link]) -> list[Link] | None:
         """These links, if no places and paths fit them."""
-        for single in (True, False):
-            control = self._courses(links, single=single)
-            control.ground([("base", []), ("least", [])])
-            if next(self._answers(lambda _: True, "ignore", 1, control=control), False):
-                return None
-        return links
+        found = any(self._has_courses(self._courses(links, single=single)) for single in (True, False))
+        return None if found else links
 
     def _links_of(self, labels: Sequence[int]) -> list[Link]:
         """The links that these labels of all steps make, each once."""
         return list(dict.fromkeys((labels[t], action, labels[u]) for t, action, u in self._chart.links))
 
     def _courses(
-        self, links: Iterable[Link], dstates: Iterable[int] = (), options: Sequence[str] = (), *, single: bool = False
+        self,
+        links: Collection[Link],
+        dstates: Iterable[int] = (),
+        options: Sequence[str] = (),
+        *,
+        single: bool = False,
+        parts: Iterable[str] = ("base", "least"),
     ) -> clingo.Control:
-        """A control for the places and paths of dstates; nothing is grounded yet."""
+        """A control for the places and paths of dstates that are linked so, and of these."""
         control = clingo.Control(["--warn=none", *options])
         control.load(encodings.path("courses"))
         control.load(encodings.path("preference"))
         dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links)))
         control.add("base", [], facts.course_facts(self._theory, dstates, links, self._actions, single=single))
+        control.ground([(part, []) for part in parts])
         return control
 
     def _least_courses(self, labels: Sequence[int], options: Sequence[str] = ()) -> clingo.Control:
@@ -213,7 +207,6 @@ class WaysEngine(NamedEngine):
         if self._asked is None or self._asked[0] != key:
             began = time.perf_counter()
             control = self._courses(self._links_of(labels), labels, options)
-            control.ground([("base", []), ("least", [])])
             self._watch.check()
             self.ground_seconds += time.perf_counter() - began
             self._asked = key, control
@@ -231,8 +224,6 @@ class WaysEngine(NamedEngine):
         read_map = facts.StreetReader(control, self._trace, self._chart, labels)
 
         def read(model: clingo.Model) -> Found:
-            found = read_map(model).without_headings()
-            counts = {"dstates": len(found.dstates), "places": len(found.places), "paths": len(found.paths)}
-            return Found(found, tuple(counts[preferred] for preferred in self._theory.priorities))
+            return Found.of(read_map(model).without_headings(), self._theory)
 
         return (yield from self._answers(read, mode, int(mode == "ignore"), control=control, conflicts=conflicts))

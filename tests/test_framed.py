@@ -36,13 +36,13 @@ from ssh_abduction.annealing import Guess, attempts
 from ssh_abduction.asking import Stopped, Watch
 from ssh_abduction.chart import QUARTERS, Chart, FramedChart, NoFrame, numbered
 from ssh_abduction.checker import check
+from ssh_abduction.engine import Cost
 from ssh_abduction.framed import FramedEngine
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.merging import merged_as_told, merged_near
 from ssh_abduction.nearby import Beside, NearbySearch
 from ssh_abduction.proof import check_bound
 from ssh_abduction.replay import Log
-from ssh_abduction.solver import Cost
 from ssh_abduction.speedups import SPEEDUPS
 
 PLAIN = Speedups.without(SPEEDUPS)

@@ -26,8 +26,9 @@ from simulator.control import STILL
 from simulator.laser import Laser
 from simulator.tours import simulate
 from simulator.world import World
+from ssh_abduction.engine import Cost
 from ssh_abduction.learner import BootstrapLearner
-from ssh_abduction.solver import Cost, solve
+from ssh_abduction.solver import solve
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
