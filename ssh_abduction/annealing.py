@@ -29,7 +29,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, count, pairwise, repeat
+from itertools import chain, cycle, pairwise, repeat
 from typing import TypeVar
 
 import numpy as np
@@ -38,8 +38,9 @@ from numpy.typing import NDArray
 from ssh_abduction.apart import clique
 from ssh_abduction.chart import Chart, FramedChart, numbered
 
-SPARES = 6  # spare names for places of a kind, as many more after two attempts, and more where names would have more than so many
+SPARES = 6  # spare names for places of a kind, and more where names would have more than so many
 VISITS = 12  # visits each
+MORE = 1, 2, 4  # times as many spare names in attempts that follow each other: the fewer visits, the more it takes
 WEIGHT = 0.002  # of the prior: for each of so many states
 STATES = 60  # that an action may lead to
 # An attempt ends where all travels lead where most such travels do. To what power probabilities are taken in the first of so many sweeps:
@@ -51,7 +52,7 @@ ROUGH, ROUGH_VISITS = ((0.6, 300), *10 * ((0.75, 150),)), 40
 STEPS = (0.75, 1500), (0.75, 500)
 ENTRIES = 60_000_000  # of the table of transitions, that are looked up for all steps in one go: 12 bytes each
 TABLE = 2_000_000  # of the table of transitions itself, states x actions x states, which is made anew for each sweep: some 20 bytes each
-SECONDS = 10.0  # after which there is no other attempt
+SECONDS = 10.0  # after which there is no other attempt, where each number of names was tried
 COLD = 0.95  # to what power in the last of them
 LAST, QUENCHED = 50, 4.0  # sweeps at the end, so that little is left to chance, and to what power then
 STRETCH = 20  # visits that are drawn in one go
@@ -110,8 +111,8 @@ def attempts(chart: FramedChart, check: Callable[[], None] = lambda: None, *, ro
     rough  be content with fewer names, as does where places were visited often, and with fewer sweeps
     """
     leaves = list(chart.leaves.values())
-    for attempt in count(1):
-        options = _options(chart, SPARES * ((attempt + 1) // 2), ROUGH_VISITS if rough else VISITS)
+    for attempt, more in enumerate(cycle(MORE), 1):
+        options = _options(chart, SPARES * more, ROUGH_VISITS if rough else VISITS)
         drawn = _Drawn(options, leaves, 4, np.random.default_rng(attempt))
         for first, sweeps in ROUGH if rough else ANNEALED:
             drawn.anneal(first, sweeps, check)

@@ -94,6 +94,10 @@ class Watch:
         part.start()
         return part
 
+    def shorten(self, seconds: float) -> None:
+        """From now on the time limit is this, if that is less."""
+        self._limit = self._allowed = seconds if self._limit is None else min(seconds, self._limit)
+
     def pause_after(self, seconds: float) -> None:
         """Let `check` raise Paused, once, when so much time was spent."""
         self._pause_at = seconds

@@ -47,7 +47,7 @@ MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much 
 # clasp's way to list answers in which no atom that is shown can be spared:
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 KEPT = 10  # controls of minimal namings that are kept until their maps are listed: each is some megabytes
-SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside
+SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside, mostly
 GUESS_FIRST = 5.0  # the same, where that has to be done first
 GUESSABLE = 1_000_000  # visits that may be one, above which annealing takes too much memory
 GUESSES = 20  # labels that are tried, near what annealing guesses
@@ -64,14 +64,25 @@ class _Naming:
 
 
 class FramedEngine(SameEngine):
-    """The full theory with frames, fewest dstates first."""
+    """The full theory with frames, fewest dstates first.
+
+    soon  seconds without the fewest dstates after which a map near a guess is sought beside
+    """
 
     lists_least = True
 
     def __init__(
-        self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups, around: Mapping[int, Sequence[int]] | None = None
+        self,
+        trace: Trace,
+        theory: Theory,
+        watch: Watch,
+        log: Log,
+        speedups: Speedups,
+        around: Mapping[int, Sequence[int]] | None = None,
+        soon: float = SOON,
     ) -> None:
         super().__init__(trace, theory, watch, log, speedups, around)
+        self._soon = soon
         self.paths = len(trace)  # names for paths are never short
         self._guess: list[int] | None = None  # labels of a map of the causal axioms
         self._guessed = False  # whether maps near the guess were sought
@@ -147,7 +158,7 @@ class FramedEngine(SameEngine):
         if not self._speedups.annealed or len(self._fits) > GUESSABLE:
             return False
         waited = self._watch.elapsed()
-        if not self._beside and waited > SOON and self._has_processors():
+        if not self._beside and waited > self._soon and self._has_processors():
             self._search_beside(self._chart)
         return self._guess is not None or (not self._beside and waited > GUESS_FIRST)
 
@@ -388,7 +399,7 @@ class FramedEngine(SameEngine):
 
     def _begin(self, chart: FramedChart, fits: frozenset[Pair]) -> None:
         super()._begin(chart, fits)
-        soon = SECONDS_A_PAIR * len(fits) > SOON  # clingo will not have been told of them before
+        soon = SECONDS_A_PAIR * len(fits) > self._soon  # clingo will not have been told of them before
         if soon and self._speedups.annealed and len(fits) <= GUESSABLE and self._has_processors():
             self._search_beside(chart)
         self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # parts of sides.lp

@@ -32,7 +32,7 @@ def maps_with_frames(trace: Trace, theory: Theory, watch: Watch, speedups: Speed
     if theory.star == "none":
         trace = trace.without_stars()
         around = _around(trace, Log(trace, theory))
-    engine = FramedEngine(trace, framed, watch, Log(trace, framed), speedups, around)
+    engine = FramedEngine(trace, framed, watch, Log(trace, framed), speedups, around, soon=0.0)
     try:
         engine.grow(len(trace))
         for found in engine.improving_maps():

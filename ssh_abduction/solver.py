@@ -66,6 +66,7 @@ FEW_STEPS = 24  # of a trace or a prefix; so many are solved sooner without name
 FRAME_AFTER = 1.0  # seconds after which a map with frames is sought, where the theory does not ask for one
 FRAMING = 30.0  # seconds that this may take, at most
 FRAMING_SHARE = 0.4  # of the time that is left, for either, if that is less
+UNMAPPED = 2.0  # times as long that may take until there is any map
 ALL = Speedups()
 
 
@@ -416,8 +417,10 @@ class Search:
         from ssh_abduction.framing import maps_with_frames  # loads numpy
 
         seconds = min(FRAMING, FRAMING_SHARE * self._watch.left())
+        watch = self._watch.part(UNMAPPED * seconds)
         try:
-            for ssh_map in maps_with_frames(self.trace, self.theory, self._watch.part(seconds), self._speedups):
+            for ssh_map in maps_with_frames(self.trace, self.theory, watch, self._speedups):
+                watch.shorten(seconds)
                 found = Found.of(ssh_map, self.theory)
                 if self.best is None or found.cost < self._cost:
                     self._keep(found, ssh_map.labels)
@@ -427,12 +430,13 @@ class Search:
 
     def _name_dstates(self) -> None:
         """Go on with the engine that settles dstates first, if the trace is known to have some map."""
+        known = self.best.labels if self.best else None
         if self.best is None:
             self._sketch()
         if self.best is not None:
             from ssh_abduction.ways import WaysEngine
 
-            self._engine = WaysEngine(self.trace, self.theory, self._watch, self._log, self._speedups, self.best.labels)
+            self._engine = WaysEngine(self.trace, self.theory, self._watch, self._log, self._speedups, known)
             self._start = len(self.trace)
 
     def _find_cost(self) -> bool:

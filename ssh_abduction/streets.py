@@ -18,7 +18,7 @@ import clingo
 import numpy as np
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.annealing import SECONDS, attempts
+from ssh_abduction.annealing import MORE, SECONDS, attempts
 from ssh_abduction.apart import Matrix
 from ssh_abduction.chart import FramedChart
 from ssh_abduction.merging import Told, merged_as_told, merged_near
@@ -95,7 +95,7 @@ class Streets:
                 if labels and self.has_single(chart, labels):
                     return labels
             found.append(ranked[0][0])
-            if time.thread_time() - began > SECONDS:
+            if len(found) >= len(MORE) and time.thread_time() - began > SECONDS:
                 return min(found, key=lambda labels: len(set(labels)))
         raise AssertionError
 

@@ -44,17 +44,17 @@ _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...]]  # labels of all 
 
 
 class WaysEngine(NamedEngine):
-    """The full theory without frames, fewest dstates first, for a trace of which some map is known.
+    """The full theory without frames, fewest dstates first, for a trace that has a map.
 
-    known  the labels of all its steps
+    known  the labels of all its steps, if one with few dstates is known
     """
 
     lists_least = True
     goes_on = False  # of the longer trace no map is known
 
-    def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups, known: Sequence[int]) -> None:
+    def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups, known: Sequence[int] | None) -> None:
         super().__init__(trace, theory, watch, log, speedups)
-        self._given_map = list(known)
+        self._given_map = known or ()
         self.paths = len(trace)  # names for paths are never short
         self._actions = dict(zip(log.actions, trace.actions, strict=True))
         self._forbidden = 0  # sets of links, so far
@@ -67,7 +67,7 @@ class WaysEngine(NamedEngine):
             return
         self._best, self._ways = None, set()
         super().grow(size)
-        self._known = numbered(self._given_map[:size])
+        self._known = numbered(self._given_map[:size]) or None
 
     def _first_spares(self) -> dict[int, int]:
         """As many as the known map needs."""

@@ -160,3 +160,31 @@ def test_a_pause_comes_once() -> None:
     with pytest.raises(Paused):
         watch.check()
     watch.check()
+
+
+def test_until_there_is_a_map_it_may_take_twice_as_long() -> None:
+    walk = maze(3, 3, steps=120, seed=0)
+    found = framing.maps_with_frames
+    left: list[float] = []
+
+    def timed(trace: Trace, theory: Theory, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
+        left.append(watch.left())
+        yield next(found(trace, theory, watch, speedups))
+        left.append(watch.left())
+        raise KeyboardInterrupt
+
+    with patch.object(framing, "maps_with_frames", timed), patch.object(Search, "_find_cost", side_effect=Paused):
+        solve(walk.trace, limit=1000)
+    assert left[1] <= solver.FRAMING < left[0] <= 2 * solver.FRAMING
+
+
+def test_a_limit_gets_only_shorter() -> None:
+    watch = started(60)
+    watch.shorten(70)
+    watch.check()
+    watch.shorten(-1)
+    with pytest.raises(Stopped):
+        watch.check()
+    unlimited = started()
+    unlimited.shorten(50)
+    assert unlimited.left() <= 50
