@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, TypeVar
 
@@ -157,6 +157,7 @@ def _held_back_interrupts() -> Iterator[None]:
 
 
 Answer = TypeVar("Answer")
+Made = TypeVar("Made")
 
 
 class Asker:
@@ -192,18 +193,27 @@ class Asker:
         on_bound: Callable[[Sequence[int]], None] | None = None,
         control: clingo.Control | None = None,
         until: Callable[[], bool] = lambda: False,
+        ahead: bool = False,
     ) -> Generator[Answer, None, bool]:
-        """What clingo answers, read at once. Returns whether it came to an end, and not to the limit of conflicts, or to where `until` holds."""
+        """What clingo answers, read at once. Returns whether it came to an end, and not to the limit of conflicts, or to where `until` holds.
+
+        ahead  let clingo search for the next answer while something is made of this one
+        """
         project = "project" if not mode.startswith("opt") else "no"
         with self._solving(control or self._control, assumptions, mode, models, project, conflicts, on_bound) as handle:
+            handle.resume()
             while True:
-                handle.resume()
                 if not self._has_come(handle, until):
                     return False
                 model = handle.model()
                 if model is None:
                     return bool(_result(handle, conflicts).exhausted)
-                yield read(model)
+                answer = read(model)
+                if ahead:
+                    handle.resume()
+                yield answer
+                if not ahead:
+                    handle.resume()
 
     def _verdict(
         self,
@@ -262,6 +272,17 @@ class Asker:
             return True
         finally:
             self.solve_seconds += time.perf_counter() - began
+
+
+def mapped(function: Callable[[Answer], Made], answers: Generator[Answer, None, bool]) -> Generator[Made, None, bool]:
+    """What a function makes of each answer. Returns what these return."""
+    with closing(answers):
+        while True:
+            try:
+                answer = next(answers)
+            except StopIteration as end:
+                return bool(end.value)
+            yield function(answer)
 
 
 def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, lru_cache
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 
@@ -412,14 +413,28 @@ def forbidden_links(links: Iterable[tuple[int, int, int]]) -> str:
     return f":- {', '.join(f'goes({s},{a},{x})' for s, a, x in links)}."
 
 
+@dataclass(frozen=True, slots=True)
+class StreetAnswer:
+    """An answer of streets.lp or courses.lp.
+
+    at     of each place that the turns tell, the place that it is at, and how it is turned to it
+    part   of each stretch, the path that it is part of, and in which direction
+    order  a path, and two places of which the first is before the other
+    """
+
+    at: dict[int, tuple[int, int]]
+    part: dict[int, tuple[int, int]]
+    order: list[tuple[int, int, int]]
+
+
 class StreetReader:
-    """Reads the maps of one labelling of nodes from answers of streets.lp or courses.lp; what the labels alone tell is worked out once."""
+    """Reads the maps of one labelling of nodes from answers of streets.lp or courses.lp; what the labels alone tell is worked out once.
+
+    An answer is asked for atoms that it may hold, those of the last one first: that takes a third of the time that it takes to read all it holds.
+    """
 
     def __init__(self, control: Control, trace: Trace, chart: Chart, labels: Sequence[int]) -> None:
-        stands, runs = (
-            {args[0]: (args[1], args[2]) for _, args in (_atom(atom.symbol) for atom in control.symbolic_atoms.by_signature(name, 3))}
-            for name in ("stands", "runs")
-        )
+        stands, runs = ({a: (b, c) for a, b, c in _literals(control, name)} for name in ("stands", "runs"))
         first: dict[int, int] = {}  # step at a dstate, by its label
         for t, node in enumerate(chart.node_of):
             first.setdefault(labels[node], t)
@@ -427,32 +442,90 @@ class StreetReader:
         self._labels = tuple(number[labels[node]] for node in chart.node_of)
         self._links = links_of(self._labels, trace)
         self._dstates = [(_view(trace, t), *stands[label], runs.get(label)) for label, t in first.items()]
+        self._passes = {
+            (run[0], component): None for _, component, _, run in self._dstates if run is not None
+        }  # stretches, and places they pass
+        self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
+        self._before: dict[tuple[int, int, int], int] = {}  # literals, 0 for what is never so
+        self._ways = dict[
+            tuple[int, int, int], tuple[tuple[int, int, int], tuple[int, int, int]]
+        ]()  # of a path's two places, as last found first
+        self._made: dict[tuple[object, ...], DState] = {}  # most dstates are the same in most maps
 
-    def __call__(self, model: Model) -> SSHMap:
-        at: dict[int, tuple[int, int]] = {}
-        part: dict[int, tuple[int, int]] = {}
-        order: list[tuple[int, int, int]] = []
-        for name, (a, b, c) in map(_atom, model.symbols(shown=True)):
-            if name == "before":
-                order.append((a, b, c))
-            else:
-                (at if name == "at" else part)[a] = (b, c)
+    def read(self, model: Model) -> StreetAnswer:
+        """What an answer holds."""
+        at, part = self._at.made_in(model), self._part.made_in(model)
+        on: dict[int, dict[int, None]] = {}  # of each path, the places on it
+        for stretch, component in self._passes:
+            on.setdefault(part[stretch][0], {})[at[component][0]] = None
+        order = []
+        for path, places in on.items():
+            for p, q in combinations(places, 2):
+                likely, other = self._ways.get((path, p, q), ((path, p, q), (path, q, p)))
+                if self._is_before(model, likely):
+                    order.append(likely)
+                elif self._is_before(model, other):
+                    order.append(other)
+                    self._ways[path, p, q] = other, likely
+        return StreetAnswer(at, part, order)
+
+    def _is_before(self, model: Model, on_path: tuple[int, int, int]) -> bool:
+        literal = self._before.get(on_path)
+        if literal is None:
+            atom = model.context.symbolic_atoms[Function("before", numbers(*on_path))]
+            literal = self._before[on_path] = atom.literal if atom else 0
+        return literal != 0 and model.is_true(literal)
+
+    def map_of(self, answer: StreetAnswer) -> SSHMap:
+        """The map that it describes."""
         arrived: dict[int, tuple[int, int]] = {}  # of each place, its number and the slot that is faced first
         faced: dict[int, tuple[int, int]] = {}  # of each path, its number and the direction that is faced first
         dstates: list[DState] = []
         for view, component, slot, run in self._dstates:
-            p, turned = at[component]
+            p, turned = answer.at[component]
             place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
             path = direction = None
             if run is not None:
-                h, ahead = part[run[0]]
+                h, ahead = answer.part[run[0]]
                 ahead *= run[1]
                 path, first = faced.setdefault(h, (len(faced), ahead))
                 direction = ahead * first
-            dstates.append(DState(len(dstates), view, place, path, direction, (slot + turned - facing) % 4))
-        before = ((*faced[h], arrived[p][0], arrived[q][0]) for h, p, q in order)
+            key = len(dstates), view, place, path, direction, (slot + turned - facing) % 4
+            dstate = self._made.get(key)
+            if dstate is None:
+                dstate = self._made[key] = DState(*key)
+            dstates.append(dstate)
+        before = ((*faced[h], arrived[p][0], arrived[q][0]) for h, p, q in answer.order)
         ordered = [(path, p, q) if first == 1 else (path, q, p) for path, first, p, q in before]
         return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(arrived))), _paths(len(faced), dstates, ordered))
+
+
+class _Choices:
+    """The atoms of which an answer holds one for each first argument."""
+
+    def __init__(self, control: Control, name: str) -> None:
+        self._among: dict[int, list[tuple[int, tuple[int, int]]]] = {}  # literals, and what they say
+        for (a, b, c), literal in _literals(control, name).items():
+            self._among.setdefault(a, []).append((literal, (b, c)))
+
+    def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
+        """What an answer says of each first argument."""
+        made = {}
+        for a, among in self._among.items():
+            if len(among) > 1 and not model.is_true(among[0][0]):
+                taken = next(i for i, (literal, _) in enumerate(among) if model.is_true(literal))
+                among.insert(0, among.pop(taken))
+            made[a] = among[0][1]
+        return made
+
+
+def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
+    """The literals of atoms with three arguments, by these."""
+    found = {}
+    for atom in control.symbolic_atoms.by_signature(name, 3):
+        a, b, c = _atom(atom.symbol)[1]
+        found[a, b, c] = atom.literal
+    return found
 
 
 def links_of(labels: Sequence[int], trace: Trace) -> tuple[tuple[int, str, int], ...]:

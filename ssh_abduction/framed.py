@@ -27,7 +27,7 @@ from itertools import chain, combinations, islice
 import clingo
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.asking import Watch
+from ssh_abduction.asking import Watch, mapped
 from ssh_abduction.chart import Chart, FramedChart, NoFrame, numbered
 from ssh_abduction.engine import Found
 from ssh_abduction.merging import kept
@@ -327,12 +327,9 @@ class FramedEngine(SameEngine):
     def _maps(self, naming: _Naming, mode: str, conflicts: int = -1) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
         control = naming.control or self._street_control(naming.labels)
-        read_map = facts.StreetReader(control, self._trace, self._chart, naming.labels)
-
-        def read(model: clingo.Model) -> Found:
-            return Found.of(read_map(model), self._theory)
-
-        return (yield from self._answers(read, mode, int(mode == "ignore"), control=control, conflicts=conflicts))
+        reader = facts.StreetReader(control, self._trace, self._chart, naming.labels)
+        answers = self._answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
+        return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), self._theory), answers))
 
     @property
     def _preparing(self) -> float:

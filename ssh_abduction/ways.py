@@ -27,7 +27,7 @@ from typing import TypeAlias
 import clingo
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.asking import Watch
+from ssh_abduction.asking import Watch, mapped
 from ssh_abduction.chart import Link, numbered
 from ssh_abduction.engine import Found
 from ssh_abduction.named import NamedEngine, Settled
@@ -221,9 +221,6 @@ class WaysEngine(NamedEngine):
     def _maps(self, labels: Sequence[int], mode: str, conflicts: int = -1, options: Sequence[str] = ()) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
         control = self._least_courses(labels, options)
-        read_map = facts.StreetReader(control, self._trace, self._chart, labels)
-
-        def read(model: clingo.Model) -> Found:
-            return Found.of(read_map(model).without_headings(), self._theory)
-
-        return (yield from self._answers(read, mode, int(mode == "ignore"), control=control, conflicts=conflicts))
+        reader = facts.StreetReader(control, self._trace, self._chart, labels)
+        answers = self._answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
+        return (yield from mapped(lambda answer: Found.of(reader.map_of(answer).without_headings(), self._theory), answers))
