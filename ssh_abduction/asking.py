@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import math
 import signal
 import sys
@@ -20,6 +21,8 @@ from ssh_abduction.speedups import Speedups
 RESERVE = 0.2  # share of the time limit kept for finding any map of the whole trace
 POLL = 0.05  # seconds between looks at the clock and for Ctrl-C
 TICK = 0.5  # seconds between reports of progress while clingo is busy
+
+_under_way: set[clingo.SolveHandle] = set()  # searches of clingo's, each in a thread
 
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
 
@@ -139,6 +142,13 @@ def peak_memory() -> float:
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 
 
+@atexit.register
+def _end_all() -> None:
+    """At Python's end, end the searches of streams that somebody still holds: their threads would abort it."""
+    for handle in list(_under_way):
+        handle.cancel()
+
+
 @contextmanager
 def _held_back_interrupts() -> Iterator[None]:
     """Ctrl-C waits until this is over: raised while clingo starts its thread, it would leave the thread without an owner."""
@@ -255,9 +265,11 @@ class Asker:
             with _held_back_interrupts():
                 handle = stack.enter_context(control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound))
             self.solve_seconds += time.perf_counter() - began
+            _under_way.add(handle)
             try:
                 yield handle
             finally:
+                _under_way.discard(handle)
                 handle.cancel()
 
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:

@@ -238,6 +238,19 @@ def test_ctrl_c_leaves_the_best_map() -> None:
         assert process.wait(20) == 0
 
 
+def test_a_stream_that_is_left_does_not_abort_python() -> None:
+    """It still has a search of clingo's, in a thread, when Python ends."""
+    program = textwrap.dedent("""
+        import sys
+        from ssh_abduction import Search, Trace
+        maps = iter(Search(Trace.load(sys.argv[1]).without_stars(), maps=1))
+        print(len(next(maps).labels))
+    """)
+    trace = os.path.join(os.path.dirname(__file__), "..", "examples", "aces3-route.jsonl")
+    done = subprocess.run([sys.executable, "-c", program, trace], check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "23\n", "")
+
+
 def test_progress_is_reported() -> None:
     reports: list[Progress] = []
     solve(drive(*TOURS["comb"]), on_progress=reports.append)
