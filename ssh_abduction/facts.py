@@ -241,6 +241,41 @@ def _named(symbol: Symbol) -> tuple[int, int]:
     return step.number, name.number
 
 
+class NameReader:
+    """Reads answers of names.lp to which all links of a trace are given: where actions lead tells the name of each step, and takes less time to ask for.
+
+    actions  after each step but the last, as numbers
+    choices  of each step, the names that it can be at
+    rests    the names for a rest
+    """
+
+    def __init__(self, actions: Sequence[int], choices: Sequence[Sequence[int]], rests: Collection[int]) -> None:
+        self._actions = actions
+        self._choices = choices
+        self._rests = rests
+        self._last: dict[tuple[int, int], tuple[int, int]] = {}  # where an action at a name led last, and the literal of that
+
+    def read(self, model: Model) -> dict[int, int]:
+        """The name of each step."""
+        atoms = model.context.symbolic_atoms
+        leads: dict[tuple[int, int], int] = {}
+        name = next(s for s in self._choices[0] if (atom := atoms[named(0, s)]) and model.is_true(atom.literal))
+        names = {0: name}
+        for t, action in enumerate(self._actions, 1):
+            if name in self._rests:
+                return read_names(model)
+            key = name, action
+            if key not in leads:
+                there, literal = self._last.get(key, (-1, 0))
+                if not literal or not model.is_true(literal):
+                    asked = ((x, atoms[Function("goes", numbers(*key, x))]) for x in self._choices[t])
+                    there, literal = next((x, atom.literal) for x, atom in asked if atom and model.is_true(atom.literal))
+                    self._last[key] = there, literal
+                leads[key] = there
+            names[t] = name = leads[key]
+        return names
+
+
 def visit_facts(
     batch: int,
     nodes: Iterable[tuple[int, int, int]],

@@ -158,7 +158,7 @@ class NamedEngine(ChartedEngine):
     def _searched(self) -> Iterator[list[int]]:
         """The same, from this search alone. Raises Settled where the one beside it has fewest dstates."""
         while not self._one_by_one:
-            lazy = len(self._links) < len(self._chart.links)
+            lazy = not self._all_given
             answer = None
             most = PATIENCE if lazy else CORES if self._speedups.one_by_one else -1
             answers = self._answers(facts.read_names, "opt", 0, conflicts=most, on_bound=self._raise_bound, until=self._settled)
@@ -315,7 +315,7 @@ class NamedEngine(ChartedEngine):
         self._end_begun()
         while True:
             spares = (self.bound or 0) - len(self.clique)
-            answers = self._answers(facts.read_names, f"enum,{spares},{spares}", 0, until=self._settled)
+            answers = self._answers(self._reader().read, f"enum,{spares},{spares}", 0, until=self._settled, ahead=True)
             answer = next(answers, None)
             if answer is None:
                 self._raise_bound([spares + 1])
@@ -330,11 +330,20 @@ class NamedEngine(ChartedEngine):
     def _all_of_bound(self, spares: int) -> Iterator[dict[int, int]]:
         """All answers of this cost that use no rest, where a search for them has begun from there on."""
         if self._begun is None:
-            yield from self._answers(facts.read_names, f"enum,{spares},0", 0, assumptions=[self._resting(False)])
+            read = self._reader().read if self._all_given else facts.read_names
+            yield from self._answers(read, f"enum,{spares},0", 0, assumptions=[self._resting(False)], ahead=True)
             return
         begun, self._begun = self._begun, None
         yield self._first
         yield from (answer for answer in begun if not self._rests(answer))
+
+    def _reader(self) -> facts.NameReader:
+        return facts.NameReader([action for _, action, _ in self._chart.links], self._choices, self._rest)
+
+    @property
+    def _all_given(self) -> bool:
+        """Whether clingo was given all links."""
+        return len(self._links) == len(self._chart.links)
 
     def settle(self) -> None:
         self._end_begun()
@@ -369,7 +378,7 @@ class NamedEngine(ChartedEngine):
                 pass
             held: list[list[int]] = []
             failed: Iterable[Link] = ()
-            lazy = len(self._links) < len(self._chart.links)
+            lazy = not self._all_given
             try:
                 for answer in self._all_of_bound(spares):
                     labels, failed = self._follow(answer)
@@ -483,6 +492,8 @@ class NamedEngine(ChartedEngine):
 
     def _follow(self, answer: dict[int, int]) -> tuple[list[int], list[Link]]:
         """The name of every node, following the answer's links from node to node, and the links that it does not explain."""
+        if self._all_given and not self._rests(answer):
+            return [answer[node] for node in range(len(answer))], []
         goes: dict[tuple[int, int], int] = {(answer[t], action): answer[u] for t, action, u in self._links}
         labels = [-1] * len(self._chart.seen)  # -1: not known
         followed: list[_Trail] = [None] * len(labels)  # links since the last node that clingo named

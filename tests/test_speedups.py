@@ -7,6 +7,7 @@ from dataclasses import fields
 from itertools import islice, product
 from unittest.mock import patch
 
+import clingo
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -63,6 +64,22 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trac
     assert set(found.maps) == set(expected.maps)
     assert found.count == len(set(found.maps))
     assert found.complete
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(machines(), st.sampled_from([0, 1]))
+def test_names_read_from_where_actions_lead_are_those_read_whole(trace: Trace, spares: int) -> None:
+    """Also of answers that use a rest, as there are few spare names."""
+    read = facts.NameReader.read
+
+    def compared(reader: facts.NameReader, model: clingo.Model) -> dict[int, int]:
+        names = read(reader, model)
+        assert names == facts.read_names(model)
+        return names
+
+    few = patch.multiple(named, PATIENCE=0, CORES=0, SPARES=spares)
+    with few, patch.object(solver, "FEW_STEPS", 0), patch.object(facts.NameReader, "read", compared):
+        assert solve(trace, Theory.causal(), maps=0).complete
 
 
 @pytest.mark.parametrize("off", NAMES)
