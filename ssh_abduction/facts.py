@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from itertools import combinations, pairwise
+from typing import TypeAlias
 
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 
@@ -16,6 +17,8 @@ from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Action, Trace
 
 _COURSE = {"pos": 1, "neg": -1}
+
+_Ahead: TypeAlias = tuple[int, int, int]  # a path, and two places of which the first is before the other
 
 
 def encoding_names(theory: Theory) -> tuple[str, ...]:
@@ -454,12 +457,12 @@ class StreetAnswer:
 
     at     of each place that the turns tell, the place that it is at, and how it is turned to it
     part   of each stretch, the path that it is part of, and in which direction
-    order  a path, and two places of which the first is before the other
+    order  which places are before others
     """
 
     at: dict[int, tuple[int, int]]
     part: dict[int, tuple[int, int]]
-    order: list[tuple[int, int, int]]
+    order: list[_Ahead]
 
 
 class StreetReader:
@@ -477,14 +480,11 @@ class StreetReader:
         self._labels = tuple(number[labels[node]] for node in chart.node_of)
         self._links = links_of(self._labels, trace)
         self._dstates = [(_view(trace, t), *stands[label], runs.get(label)) for label, t in first.items()]
-        self._passes = {
-            (run[0], component): None for _, component, _, run in self._dstates if run is not None
-        }  # stretches, and places they pass
+        # Stretches, each with a place that it passes:
+        self._passes = {(run[0], component): None for _, component, _, run in self._dstates if run is not None}
         self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
-        self._before: dict[tuple[int, int, int], int] = {}  # literals, 0 for what is never so
-        self._ways = dict[
-            tuple[int, int, int], tuple[tuple[int, int, int], tuple[int, int, int]]
-        ]()  # of a path's two places, as last found first
+        self._before: dict[_Ahead, int] = {}  # literals, 0 for what is never so
+        self._turned: set[_Ahead] = set()  # what was the other way round when it was last asked for
         self._made: dict[tuple[object, ...], DState] = {}  # most dstates are the same in most maps
 
     def read(self, model: Model) -> StreetAnswer:
@@ -496,19 +496,20 @@ class StreetReader:
         order = []
         for path, places in on.items():
             for p, q in combinations(places, 2):
-                likely, other = self._ways.get((path, p, q), ((path, p, q), (path, q, p)))
-                if self._is_before(model, likely):
-                    order.append(likely)
-                elif self._is_before(model, other):
-                    order.append(other)
-                    self._ways[path, p, q] = other, likely
+                ways = (path, p, q), (path, q, p)
+                turned = ways[0] in self._turned
+                if self._is_before(model, ways[turned]):
+                    order.append(ways[turned])
+                elif self._is_before(model, ways[not turned]):
+                    order.append(ways[not turned])
+                    self._turned ^= {ways[0]}
         return StreetAnswer(at, part, order)
 
-    def _is_before(self, model: Model, on_path: tuple[int, int, int]) -> bool:
-        literal = self._before.get(on_path)
+    def _is_before(self, model: Model, ahead: _Ahead) -> bool:
+        literal = self._before.get(ahead)
         if literal is None:
-            atom = model.context.symbolic_atoms[Function("before", numbers(*on_path))]
-            literal = self._before[on_path] = atom.literal if atom else 0
+            atom = model.context.symbolic_atoms[Function("before", numbers(*ahead))]
+            literal = self._before[ahead] = atom.literal if atom else 0
         return literal != 0 and model.is_true(literal)
 
     def map_of(self, answer: StreetAnswer) -> SSHMap:

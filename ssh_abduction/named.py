@@ -338,7 +338,7 @@ class NamedEngine(ChartedEngine):
         yield from (answer for answer in begun if not self._rests(answer))
 
     def _reader(self) -> facts.NameReader:
-        return facts.NameReader([action for _, action, _ in self._chart.links], self._choices, self._rest)
+        return facts.NameReader(self._log.actions[: self.size - 1], self._choices, self._rest)
 
     @property
     def _all_given(self) -> bool:

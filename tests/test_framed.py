@@ -643,8 +643,8 @@ def test_a_true_guess_stays_as_it_is(seed: int) -> None:
     assert merged_as_told(apart, chart.links, some, partial(asked._streets.told, chart)) == truth
 
 
-@pytest.mark.parametrize("loops", [0.1, 0.3])
-def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float) -> None:
+@pytest.mark.parametrize(("loops", "most"), [(0.1, 1.1), (0.3, 1.2)])
+def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, most: float) -> None:
     """Annealing ends early, so some travels do not lead where they should."""
     walk = maze(6, 6, steps=1200, seed=1, stars=True, loops=loops)
     asked = framed_engine(walk.trace, Theory.topological())
@@ -660,7 +660,7 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float) ->
         labels = asked._streets.guessed_labels(chart, lambda: None)
     assert failed[0] > 0
     assert asked._streets.has_single(chart, labels)
-    assert len(set(labels)) < 1.2 * len(set(walk.truth))
+    assert len(set(labels)) < most * len(set(walk.truth))
 
 
 def test_a_guess_leaves_a_small_map_when_time_is_over() -> None:
