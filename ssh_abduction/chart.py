@@ -176,19 +176,20 @@ class FramedChart(Chart):
         steps = zip(pairwise(self.node_of), trace.actions, strict=False)
         return list(dict.fromkeys((s, action.turn, x) for (s, x), action in steps if action.turn))
 
-    @property
-    def fitting(self) -> int:
-        """How many pairs of visits `fits` has, which may be too many to list."""
+    @cached_property
+    def fitting(self) -> NDArray[np.int_]:
+        """How many pairs `fits` has of so many of the first visits, 0 to all; these may be too many to list."""
         import numpy as np
 
-        return int(np.count_nonzero(np.triu(~self.misfits, 1)))
+        return np.cumsum([0, *np.count_nonzero(np.triu(~self.misfits, 1), axis=(0, 1))])
 
-    def fits(self) -> list[tuple[int, int, int]]:
-        """Visits I < J that may be at one place, and R, where slot 0 of I is then slot R of J."""
+    def fits(self, visits: Sequence[int]) -> list[tuple[int, int, int]]:
+        """Visits I < J of these, which are in order, that may be at one place, and R, where slot 0 of I is then slot R of J."""
         import numpy as np
 
-        turns, first, second = np.nonzero(np.triu(~self.misfits, 1))
-        return list(zip(first.tolist(), second.tolist(), turns.tolist(), strict=True))
+        some = np.asarray(visits)
+        turns, first, second = np.nonzero(np.triu(~self.misfits[:, some[:, None], some], 1))
+        return list(zip(some[first].tolist(), some[second].tolist(), turns.tolist(), strict=True))
 
     @cached_property
     def misfits(self) -> NDArray[np.bool_]:

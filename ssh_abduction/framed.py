@@ -155,7 +155,7 @@ class FramedEngine(SameEngine):
             self._heed(self._beside)
         if self._guessed:
             return self._labels_beside() is not None or (self._known is not None and self.bound == len(set(self._known)))
-        if not self._speedups.annealed or len(self._fits) > GUESSABLE:
+        if not self._speedups.annealed or self._chart.fitting[-1] > GUESSABLE:
             return False
         waited = self._watch.elapsed()
         if not self._beside and waited > self._soon and self._has_processors():
@@ -188,7 +188,7 @@ class FramedEngine(SameEngine):
             self._chart = self._charted(len(self._trace))
         except NoFrame:
             return None
-        if self._chart.fitting > GUESSABLE:
+        if self._chart.fitting[-1] > GUESSABLE:
             return None
         return self._single_streets(self._streets.guessed_labels(self._chart, self._watch.check))
 
@@ -355,10 +355,14 @@ class FramedEngine(SameEngine):
         if self._speedups.sides and len(self._fits) <= MANY_PAIRS and self._say_street(labels):
             return
         rules = []
-        for clash in self._clashing(labels):
+        clashes = self._clashing(labels)
+        if unknown := {self._chart.facing[node][0] for clash in clashes for node in clash} - self._visits:
+            self._give_more(unknown)
+        for clash in clashes:
             first = {labels[node]: node for node in clash}
             different = [pair for a, b in combinations(first.values(), 2) if (pair := self._pair(a, b)) in self._fits]
-            rules.append(facts.forbidden_pairs(self._spanning(labels, clash), different))
+            if self._fits.issuperset(together := self._spanning(labels, clash)):  # else clingo knows by now
+                rules.append(facts.forbidden_pairs(together, different))
         self._tell("\n".join(rules))
 
     def _say_street(self, labels: Sequence[int]) -> bool:
@@ -367,7 +371,7 @@ class FramedEngine(SameEngine):
         control.add("base", [], facts.settled_labels(enumerate(labels)))
         control.ground([("base", []), ("again", []), ("contrary", [])])
         contrary, twice = next(self._answers(facts.read_contrary, "ignore", 1, control=control))
-        stand = {label: self._chart.facing[node] for node, label in enumerate(labels)}
+        stand = {labels[node]: self._chart.facing[node] for node in self._place_of}
         if any(self._say_once("street", *stand[dstate]) for dstate in contrary):
             return True
         for visit in (stand[dstate][0] for dstate in twice):
@@ -397,12 +401,12 @@ class FramedEngine(SameEngine):
     def _begin(self, chart: FramedChart, fits: frozenset[Pair]) -> None:
         super()._begin(chart, fits)
         soon = SECONDS_A_PAIR * len(fits) > self._soon  # clingo will not have been told of them before
-        if soon and self._speedups.annealed and len(fits) <= GUESSABLE and self._has_processors():
+        if soon and self._speedups.annealed and chart.fitting[-1] <= GUESSABLE and self._has_processors():
             self._search_beside(chart)
         self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # parts of sides.lp
 
-    def _give(self, chart: FramedChart, order: Sequence[int], fits: frozenset[Pair]) -> None:
-        super()._give(chart, order, fits)
+    def _give(self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False) -> None:
+        super()._give(chart, visits, order, anew=anew)
         if self._said:
             streets = [(part, facts.numbers(*arguments, self._batch)) for part, arguments in self._said if part == "street"]
             self._control.ground([("streets", facts.numbers(self._batch)), *streets])

@@ -10,6 +10,10 @@ clingo was told and what it learned still holds.
 *Transitive.* That I is J and J is K, so I is K, is said only of visits where an answer fails to hold it: there are some millions of
 threes. Until no answer fails, what clingo solves is a relaxation, so its bounds hold.
 
+*Lazily.* Of a long trace clingo is told of the first visits, until many of them may be one, and of the visits of the clique. An answer says where the
+others are, too (`localising.py`); where it does not, clingo is told of these visits, and of as many before them as it takes. Fewer visits are a relaxation,
+and an answer that says where all visits are is one of them all: so more of the same costs no more.
+
 *From below.* clingo is asked for an answer without lone nodes but those that are alone for sure. A core, nodes that cannot all be
 avoided, raises the bound by one; from then on it is asked that at most one of them is alone, then two, and so on (OLL: Andres,
 Kaufmann, Matheis, Schaub 2012, "Unsatisfiability-based optimization in clasp"). Each optimum of the whole holds what is asked for
@@ -25,6 +29,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Self, TypeAlias, TypeVar
 
 import clingo
@@ -35,12 +40,14 @@ from ssh_abduction.apart import clique
 from ssh_abduction.asking import Watch, new_control
 from ssh_abduction.chart import Chart, FramedChart, numbered
 from ssh_abduction.engine import ChartedEngine
+from ssh_abduction.localising import Located, State, faced, located
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
 SECONDS_A_PAIR = 3e-5  # what clingo takes, about, to ground two visits that may be one: it cannot be stopped meanwhile
+FIRST_PAIRS = 10_000  # visits that may be one, of which clingo is told at first
 AT_A_TIME = 20_000  # threes of visits that clingo is told of in one go
 TRY_CONFLICTS = 100  # conflicts after which it is left open whether a core can be smaller
 FAILED_TRIES = 20  # tries after which a core is kept as it is
@@ -92,28 +99,41 @@ class SameEngine(ChartedEngine):
             chart = replace(Chart.framed(self._trace, self._log, size, self._around), elsewhere=self._chart.elsewhere)
             grown = len(chart.seen) <= GROWN * self._first_nodes
         if grown:
-            order = list(range(len(self._chart.seen), len(chart.seen)))
+            new = range(len(self._chart.stars), len(chart.stars)) if self._knows_all else ()
+            self._give(chart, {*self._visits, *new}, range(len(chart.seen)))
         else:
             chart = self._charted(size)
             apart = chart.apart()
             self._watch.check()
             self.clique = clique(apart, chart.seen) if self._speedups.clique else []
             order = [*self.clique, *sorted(set(range(len(apart))) - set(self.clique), key=lambda node: (-int(apart[node].sum()), node))]
-        self._watch.check(SECONDS_A_PAIR * (chart.fitting - (len(self._fits) if grown else 0)))
-        fits = frozenset(chart.fits())
-        self.size = 0  # until clingo was told all of it
-        if not grown:
-            self._begin(chart, fits)
-        self._give(chart, order, fits)
+            self._give(chart, self._first_visits(chart), order, anew=True)
         self.size = size
+        self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
+        self._known = None
         self.ground_seconds += time.perf_counter() - began
 
+    def _first_visits(self, chart: FramedChart) -> set[int]:
+        """The visits that clingo is told of first: all, unless too many may be one."""
+        if not self._speedups.lazy or chart.fitting[-1] <= FIRST_PAIRS:
+            return set(range(len(chart.stars)))
+        first = range(int(np.searchsorted(chart.fitting, FIRST_PAIRS, side="right")) - 1)
+        return {0, *first, *(chart.facing[node][0] for node in self.clique)}
+
+    @property
+    def _knows_all(self) -> bool:
+        """Whether clingo was told of all visits."""
+        return len(self._visits) == len(self._chart.stars)
+
     def _begin(self, chart: FramedChart, fits: frozenset[Pair]) -> None:
-        """Take a control that knows nothing, for a chart of which these visits may be one."""
+        """Take a control that knows nothing, for visits of a chart of which these may be one."""
         self._first_nodes = len(chart.seen)
         self._control = new_control("same", "", ["--heuristic=Domain"], self._speedups)
         self._batch = -1
-        self._chart = FramedChart((), (), (), (), (), ())  # what clingo knows
+        self._visits: set[int] = set()  # that clingo knows, and of these
+        self._place_of: dict[int, int] = {}  # where nodes are in the order of choice
+        self._ends: set[int] = set()  # visits of which it knows how they end
+        self._turns: set[tuple[int, str, int]] = set()
         self._fits: frozenset[Pair] = frozenset()
         self._least = 0
         self._avoided: dict[int, clingo.Symbol] = {}  # what is assumed not to be there, by the literal of that
@@ -124,21 +144,38 @@ class SameEngine(ChartedEngine):
         self._core_sizes: list[int] = []
         self._parts = 0
 
-    def _give(self, chart: FramedChart, order: Sequence[int], fits: frozenset[Pair]) -> None:
-        """Tell clingo what it does not know yet of a chart. New nodes come after the others in the order of choice."""
-        if self._batch >= 0:
+    def _give(self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False) -> None:
+        """Tell clingo what it does not know yet of these visits of a chart. New nodes come after the others in the order of choice."""
+        told = sorted(visits)
+        known = 0 if anew else len(self._fits)
+        self._watch.check(SECONDS_A_PAIR * (int(chart.fitting[-1]) - known) if len(told) == len(chart.stars) else 0.0)
+        fits = frozenset(chart.fits(told))
+        self._watch.check(SECONDS_A_PAIR * (len(fits) - known))
+        size, self.size = self.size, 0  # until clingo was told all of it
+        if anew:
+            self._begin(chart, fits)
+        else:
             self._control.release_external(facts.listed(self._batch))
-        known, self._chart = self._chart, chart
+        self._chart = chart
         self._batch += 1
-        nodes = [(place, *chart.facing[node]) for place, node in enumerate(order, len(known.seen))]
-        leaves = [(visit, *how) for visit, how in chart.leaves.items() if visit not in known.leaves]
-        visits = range(len(known.stars), len(chart.stars))
-        turns = chart.turns(self._trace)[len(known.turns(self._trace)) :]
+        added = sorted(visits - self._visits)
+        self._visits |= visits
+        nodes = []
+        for node in order:
+            if node not in self._place_of and chart.facing[node][0] in visits:
+                self._place_of[node] = len(self._place_of)
+                nodes.append((self._place_of[node], *chart.facing[node]))
+        leaves = [
+            (visit, *how) for visit, how in chart.leaves.items() if visit in visits and visit + 1 in visits and visit not in self._ends
+        ]
+        self._ends.update(visit for visit, *_ in leaves)
+        turns = [turn for turn in chart.turns(self._trace) if turn not in self._turns and chart.facing[turn[0]][0] in visits]
+        self._turns.update(turns)
         new, unfit = sorted(fits - self._fits), sorted(self._fits - fits)
         self._fits = fits
         part = f"visits_{self._batch}"
         self._control.add(part, [], facts.visit_facts(self._batch, nodes, leaves, new, unfit))
-        self._control.add(part, [], facts.turn_facts(self._batch, chart, visits, turns))
+        self._control.add(part, [], facts.turn_facts(self._batch, chart, added, turns))
         self._control.ground([(part, []), ("more", facts.numbers(self._batch))])
         self._control.assign_external(facts.listed(self._batch), True)
         atoms = self._control.symbolic_atoms
@@ -150,9 +187,16 @@ class SameEngine(ChartedEngine):
                 self._avoided[-atom.literal] = atom.symbol
         self._raise_bound()
         self._unread += new
-        self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
-        self._excluded = 0  # so many of them clingo will not find again
-        self._known = None
+        self._excluded = 0  # so many of the labels found clingo will not find again
+        self.size = size
+
+    def _give_more(self, visits: Iterable[int]) -> None:
+        """Tell clingo of these visits, too."""
+        began = time.perf_counter()
+        more = {*self._visits, *visits}
+        assert more != self._visits  # else that would go on without end
+        self._give(self._chart, more, range(len(self._chart.seen)))
+        self.ground_seconds += time.perf_counter() - began
 
     def _raise_bound(self) -> None:
         self.bound = max(self.bound or 0, self._least)
@@ -166,11 +210,20 @@ class SameEngine(ChartedEngine):
             pairs = self._fewest(until)
             if pairs is None:
                 return None
-            if threes := self._intransitive(pairs):
-                self._close(threes)
-            else:
-                self._found.append(self._labels(pairs))
+            if labels := self._settled(pairs):
+                self._found.append(labels)
         return list(self._found[0])
+
+    def _settled(self, pairs: Sequence[Pair]) -> tuple[int, ...] | None:
+        """The dstate of each node in an answer; None if that is not transitive, or does not say where all visits are, and clingo is told so."""
+        if threes := self._intransitive(pairs):
+            self._close(threes)
+            return None
+        everywhere = self._located(pairs)
+        if everywhere.missed:
+            self._give_more(everywhere.missed)
+            return None
+        return self._labels(everywhere)
 
     def _fewest(self, until: Callable[[], bool]) -> list[Pair] | None:
         """An answer with the fewest lone nodes."""
@@ -253,15 +306,20 @@ class SameEngine(ChartedEngine):
         yield tuple(numbered(guess))
         states = _states(self._chart, guess)
         place_of: dict[int, int] = {}  # by the literal that two of its visits are one
+        freed: set[int] = set()
         avoided: set[int] = set()
-        self._read_literals()
-        for (i, j, r), literal in self._transitive.literals.items():
-            if states[i] // 4 == states[j] // 4 and (states[i] - states[j]) % 4 == r:
-                place_of[literal] = states[i] // 4
-            else:
-                avoided.add(-literal)
-        patient = False
+        patient, pairs, batch = False, 0, -1
         while True:
+            if batch < self._batch:
+                batch = self._batch
+                self._read_literals()
+                for (i, j, r), literal in islice(self._transitive.literals.items(), pairs, None):
+                    if states[i] // 4 != states[j] // 4 or (states[i] - states[j]) % 4 != r:
+                        avoided |= set() if patient else {-literal}
+                    elif states[i] // 4 not in freed:
+                        place_of[literal] = states[i] // 4
+                pairs = len(self._transitive.literals)
+                patient = False
             if self._known and not patient:
                 patient, avoided = True, set(self._avoided)
             yield None
@@ -270,14 +328,12 @@ class SameEngine(ChartedEngine):
                 if fewer := [literal for literal in core if literal in avoided]:
                     avoided.difference_update(fewer[-1:] if patient else fewer)
                 elif core:
-                    free = self._together_impossible(sorted({place_of[literal] for literal in core}), place_of)
-                    place_of = {literal: place for literal, place in place_of.items() if place not in free}
+                    freed.update(self._together_impossible(sorted({place_of[literal] for literal in core}), place_of))
+                    place_of = {literal: place for literal, place in place_of.items() if place not in freed}
                 else:
                     return
-            elif threes := self._intransitive(answer or ()):
-                self._close(threes)
-            else:
-                yield self._labels(answer or ())
+            elif labels := self._settled(answer or ()):
+                yield labels
 
     def _together_impossible(self, places: list[int], place_of: Mapping[int, int]) -> list[int]:
         """Of places that cannot all be as guessed, few that cannot."""
@@ -299,7 +355,7 @@ class SameEngine(ChartedEngine):
         yield from map(list, self._found)
         asked = 0
         while True:
-            known = [self._spanning(found, range(len(found))) for found in self._found[self._excluded :]]
+            known = [self._spanning(found, self._place_of) for found in self._found[self._excluded :]]
             self._tell("\n".join(facts.forbidden_pairs(pairs, listed=self._batch) for pairs in known))
             self._excluded = len(self._found)
             labels = self._other(dstates)
@@ -316,9 +372,9 @@ class SameEngine(ChartedEngine):
     def _nearby(self, dstates: int) -> Generator[list[int], None, bool]:
         """Answers, each from the one before. Returns whether these are all that was not excluded."""
 
-        def read(model: clingo.Model) -> tuple[int, ...]:
+        def read(model: clingo.Model) -> Located:
             self._transitive.failed = 0
-            return self._labels(self._pairs(model))
+            return self._located(self._pairs(model))
 
         excluded = set(self._found[self._excluded :])
         self._read_literals()
@@ -328,15 +384,20 @@ class SameEngine(ChartedEngine):
         try:
             while True:
                 try:
-                    labels = next(answers)
+                    everywhere = next(answers)
                 except StopIteration as end:
                     return bool(end.value)
+                if everywhere.missed:
+                    break
+                labels = self._labels(everywhere)
                 if labels not in excluded:
                     self._found.append(labels)
                     yield list(labels)
         finally:
             answers.close()
             self._transitive.asked = False
+        self._give_more(everywhere.missed)
+        return False
 
     def _other(self, dstates: int) -> tuple[int, ...] | None:
         """An answer of so many dstates that was not excluded."""
@@ -345,9 +406,8 @@ class SameEngine(ChartedEngine):
             pairs, _ = self._verdict(self._pairs, assumed, mode=mode)
             if pairs is None:
                 return None
-            if not (threes := self._intransitive(pairs)):
-                return self._labels(pairs)
-            self._close(threes)
+            if labels := self._settled(pairs):
+                return labels
 
     def _asking_for(self, dstates: int) -> tuple[str, list[int]]:
         """How clingo is asked for so many dstates, at most, and what is assumed."""
@@ -394,17 +454,21 @@ class SameEngine(ChartedEngine):
                 break
         return list(found)
 
-    def _labels(self, pairs: Iterable[Pair]) -> tuple[int, ...]:
-        """The dstate of each node in an answer that is transitive, numbered by the first node there."""
+    def _located(self, pairs: Iterable[Pair]) -> Located:
+        """Where all visits are in an answer that is transitive."""
         first: dict[int, tuple[int, int]] = {}
         for i, j, r in sorted(pairs):
             first.setdefault(j, (i, r))
-        number: dict[tuple[int, int], int] = {}
-        labels = []
-        for visit, slot in self._chart.facing:
+        number: dict[int, int] = {}
+        states: dict[int, State] = {}
+        for visit in sorted(self._visits):
             i, r = first.get(visit, (visit, 0))
-            labels.append(number.setdefault((i, (slot - r) % 4), len(number)))
-        return tuple(labels)
+            states[visit] = 4 * number.setdefault(i, len(number)) + -r % 4
+        return located(self._chart, states)
+
+    def _labels(self, everywhere: Located) -> tuple[int, ...]:
+        """The dstate of each node, numbered by the first node there."""
+        return tuple(numbered(faced(everywhere.states[visit], slot) for visit, slot in self._chart.facing))
 
 
 def _states(chart: FramedChart, labels: Sequence[int]) -> list[int]:

@@ -18,7 +18,7 @@ class Speedups:
     names        causal theory: give the dstates names beforehand; full theory where places have frames: settle them before places and paths
     clique       with names: pin steps that are pairwise apart; with frames: let such nodes be the first at their dstates
     apart        with names: say which steps are apart, where more than one action shows it
-    lazy         with names: give clingo only the links that replaying contradicts
+    lazy         with names: give clingo only the links that replaying contradicts; with frames: of a long trace only the visits without which others are lost
     core_guided  with names or frames: raise the bound from below, rather than better the map
     small_cores  with frames: make cores smaller, as long as that is cheap
     sides        with frames: say what order and sides forbid while dstates are sought, street by street
