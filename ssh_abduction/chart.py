@@ -176,6 +176,21 @@ class FramedChart(Chart):
         steps = zip(pairwise(self.node_of), trace.actions, strict=False)
         return list(dict.fromkeys((s, action.turn, x) for (s, x), action in steps if action.turn))
 
+    def beginning(self, visits: int) -> FramedChart:
+        """The chart of the first so many visits."""
+        nodes = next((node for node, (visit, _) in enumerate(self.facing) if visit == visits), len(self.facing))
+        steps = next((step for step, node in enumerate(self.node_of) if node >= nodes), len(self.node_of))
+        links = tuple(link for link in self.links if max(link[0], link[2]) < nodes)
+        return FramedChart(
+            self.seen[:nodes], links, self.node_of[:steps], self.facing[:nodes], self.stars[:visits], self.travels[: visits - 1]
+        )
+
+    def visits_with(self, pairs: int) -> int:
+        """How many of the first visits have so many pairs, at most, that may be one."""
+        import numpy as np
+
+        return int(np.searchsorted(self.fitting, pairs, side="right")) - 1
+
     @cached_property
     def fitting(self) -> NDArray[np.int_]:
         """How many pairs `fits` has of so many of the first visits, 0 to all; these may be too many to list."""

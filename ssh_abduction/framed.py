@@ -27,7 +27,7 @@ from itertools import chain, combinations, islice
 import clingo
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.asking import Watch, mapped
+from ssh_abduction.asking import POLL, Watch, mapped
 from ssh_abduction.chart import Chart, FramedChart, NoFrame, numbered
 from ssh_abduction.engine import Found
 from ssh_abduction.merging import kept
@@ -49,7 +49,8 @@ SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 KEPT = 10  # controls of minimal namings that are kept until their maps are listed: each is some megabytes
 SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside, mostly
 GUESS_FIRST = 5.0  # the same, where that has to be done first
-GUESSABLE = 1_000_000  # visits that may be one, above which annealing takes too much memory
+LATER = 4  # times as long, where clingo was not told of all visits: then that is waited for,
+LATER_SHARE = 0.25  # or so much of the time limit, if that is less
 GUESSES = 20  # labels that are tried, near what annealing guesses
 GUESSING = 1000  # conflicts after which better streets of these are no longer sought
 BETTERING = 20_000  # conflicts after which better streets are no longer sought one after another
@@ -66,7 +67,7 @@ class _Naming:
 class FramedEngine(SameEngine):
     """The full theory with frames, fewest dstates first.
 
-    soon  seconds without the fewest dstates after which a map near a guess is sought beside
+    soon  seconds without the fewest dstates after which a map near a guess is sought beside; SOON if not given
     """
 
     lists_least = True
@@ -79,10 +80,10 @@ class FramedEngine(SameEngine):
         log: Log,
         speedups: Speedups,
         around: Mapping[int, Sequence[int]] | None = None,
-        soon: float = SOON,
+        soon: float | None = None,
     ) -> None:
         super().__init__(trace, theory, watch, log, speedups, around)
-        self._soon = soon
+        self._soon = SOON if soon is None else soon
         self.paths = len(trace)  # names for paths are never short
         self._guess: list[int] | None = None  # labels of a map of the causal axioms
         self._guessed = False  # whether maps near the guess were sought
@@ -155,12 +156,16 @@ class FramedEngine(SameEngine):
             self._heed(self._beside)
         if self._guessed:
             return self._labels_beside() is not None or (self._known is not None and self.bound == len(set(self._known)))
-        if not self._speedups.annealed or self._chart.fitting[-1] > GUESSABLE:
+        if not self._speedups.annealed:
             return False
         waited = self._watch.elapsed()
-        if not self._beside and waited > self._soon and self._has_processors():
+        soon = self._soon if self._knows_all else min(LATER * self._soon, LATER_SHARE * (waited + self._watch.left()))
+        if not self._beside and waited > soon and self._has_processors():
             self._search_beside(self._chart)
-        return self._guess is not None or (not self._beside and waited > GUESS_FIRST)
+        while self._beside and self._beside.running and self._guess is None and not self._knows_all:
+            self._watch.check()  # both are much Python, of which one thread runs at a time
+            time.sleep(POLL)
+        return self._guess is not None or (not self._beside and waited > max(soon, GUESS_FIRST))
 
     def _search_beside(self, chart: FramedChart) -> None:
         """Begin to guess in another thread, and to prove from there that the causal axioms need so many dstates."""
@@ -187,8 +192,6 @@ class FramedEngine(SameEngine):
         try:
             self._chart = self._charted(len(self._trace))
         except NoFrame:
-            return None
-        if self._chart.fitting[-1] > GUESSABLE:
             return None
         return self._single_streets(self._streets.guessed_labels(self._chart, self._watch.check))
 
@@ -401,7 +404,7 @@ class FramedEngine(SameEngine):
     def _begin(self, chart: FramedChart, fits: frozenset[Pair]) -> None:
         super()._begin(chart, fits)
         soon = SECONDS_A_PAIR * len(fits) > self._soon  # clingo will not have been told of them before
-        if soon and self._speedups.annealed and chart.fitting[-1] <= GUESSABLE and self._has_processors():
+        if soon and self._speedups.annealed and self._has_processors():
             self._search_beside(chart)
         self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # parts of sides.lp
 

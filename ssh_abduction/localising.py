@@ -8,7 +8,7 @@ visit, and as many before it as it takes to know where it is.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -37,6 +37,31 @@ def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
     return _Localiser(chart, states).located()
 
 
+def tracked(chart: FramedChart, states: Mapping[int, State]) -> list[State]:
+    """The same, as far as the map says: -1 where it is not known where a visit is."""
+    return _Localiser(chart, states).tracked()
+
+
+def states_of(chart: FramedChart, labels: Sequence[int]) -> list[State]:
+    """Of each visit 4 times the number of a place, and the slot of the place that slot 0 of the visit is. Visits that share a label are at one place."""
+    at: dict[int, list[tuple[int, int]]] = {}  # visits and slots, by label
+    faced: dict[int, list[tuple[int, int]]] = {}  # slots and labels, by visit
+    for (visit, slot), label in zip(chart.facing, labels, strict=True):
+        at.setdefault(label, []).append((visit, slot))
+        faced.setdefault(visit, []).append((slot, label))
+    states: dict[int, int] = {}
+    for first in faced:
+        work = [] if first in states else [first]
+        states.setdefault(first, 4 * first)
+        for visit in work:
+            for slot, label in faced[visit]:
+                for other, turned in at.pop(label, ()):
+                    if other not in states:
+                        states[other] = states[visit] // 4 * 4 + (states[visit] + slot - turned) % 4
+                        work.append(other)
+    return [states[visit] for visit in range(len(states))]
+
+
 class _Localiser:
     """A map: the states of some visits, where what was done there leads, and which states fit the others."""
 
@@ -53,6 +78,14 @@ class _Localiser:
             for slot, action in [self._leaves[visit]]
         }
         self._fits = _fitting(chart, states)
+
+    def tracked(self) -> list[State]:
+        possible = self._anywhere(0)
+        found = [possible]
+        for visit in range(1, len(self._slots)):
+            possible = self._after(possible, visit - 1) or self._anywhere(visit)
+            found.append(possible)
+        return [next(iter(states)) if len(states) == 1 else -1 for states in found]
 
     def located(self) -> Located:
         possible = self._anywhere(0)

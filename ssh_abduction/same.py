@@ -40,7 +40,7 @@ from ssh_abduction.apart import clique
 from ssh_abduction.asking import Watch, new_control
 from ssh_abduction.chart import Chart, FramedChart, numbered
 from ssh_abduction.engine import ChartedEngine
-from ssh_abduction.localising import Located, State, faced, located
+from ssh_abduction.localising import Located, State, faced, located, states_of
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
@@ -117,8 +117,7 @@ class SameEngine(ChartedEngine):
         """The visits that clingo is told of first: all, unless too many may be one."""
         if not self._speedups.lazy or chart.fitting[-1] <= FIRST_PAIRS:
             return set(range(len(chart.stars)))
-        first = range(int(np.searchsorted(chart.fitting, FIRST_PAIRS, side="right")) - 1)
-        return {0, *first, *(chart.facing[node][0] for node in self.clique)}
+        return {0, *range(chart.visits_with(FIRST_PAIRS)), *(chart.facing[node][0] for node in self.clique)}
 
     @property
     def _knows_all(self) -> bool:
@@ -304,7 +303,7 @@ class SameEngine(ChartedEngine):
         lone nodes; of those that a core shows to be too many, one is left alone. Visits of places that cannot all be as guessed are let free.
         """
         yield tuple(numbered(guess))
-        states = _states(self._chart, guess)
+        states = states_of(self._chart, guess)
         place_of: dict[int, int] = {}  # by the literal that two of its visits are one
         freed: set[int] = set()
         avoided: set[int] = set()
@@ -469,26 +468,6 @@ class SameEngine(ChartedEngine):
     def _labels(self, everywhere: Located) -> tuple[int, ...]:
         """The dstate of each node, numbered by the first node there."""
         return tuple(numbered(faced(everywhere.states[visit], slot) for visit, slot in self._chart.facing))
-
-
-def _states(chart: FramedChart, labels: Sequence[int]) -> list[int]:
-    """Of each visit 4 times the number of a place, and the slot of the place that slot 0 of the visit is. Visits that share a label are at one place."""
-    at: dict[int, list[tuple[int, int]]] = {}  # visits and slots, by label
-    faced: dict[int, list[tuple[int, int]]] = {}  # slots and labels, by visit
-    for (visit, slot), label in zip(chart.facing, labels, strict=True):
-        at.setdefault(label, []).append((visit, slot))
-        faced.setdefault(visit, []).append((slot, label))
-    states: dict[int, int] = {}
-    for first in faced:
-        work = [] if first in states else [first]
-        states.setdefault(first, 4 * first)
-        for visit in work:
-            for slot, label in faced[visit]:
-                for other, turned in at.pop(label, ()):
-                    if other not in states:
-                        states[other] = states[visit] // 4 * 4 + (states[visit] + slot - turned) % 4
-                        work.append(other)
-    return [states[visit] for visit in range(len(states))]
 
 
 def smaller(members: list[Member], shrunk: Callable[[list[Member]], list[Member] | None], tries: int | None = None) -> list[Member]:

@@ -50,6 +50,7 @@ from enum import Enum
 from ssh_abduction import facts
 from ssh_abduction.asking import Grounding, Paused, Stop, Stopped, Watch
 from ssh_abduction.certificate import RESTS_ON, Certificate, Evidence
+from ssh_abduction.checker import check
 from ssh_abduction.engine import AT_ONCE, Cost, Engine, Found, StepEngine
 from ssh_abduction.errors import SolverError, TheoryError, TraceError, brief
 from ssh_abduction.maps import SSHMap
@@ -450,7 +451,6 @@ class Search:
             if minimal is None:
                 self.status = Status.UNSATISFIABLE
                 return False
-            self.partial = minimal.map
             self._raise_bound(minimal.cost[0] if minimal.cost else None)
             if self._lower is None or minimal.cost > self._lower:
                 self._lower = minimal.cost
@@ -483,12 +483,16 @@ class Search:
         self._merge()
         if self.best is not None:
             return
-        first, *rest = self.trace.steps
-        for sketch in Sketch.all_of(first, self.theory):
-            if all(sketch.extend(action, step) for action, step in zip(self.trace.actions, rest, strict=True)):
-                found = sketch.map()
-                self._keep(Found.of(found, self.theory), found.labels)
-                return
+        trace, first = self.trace, self.trace.steps[0]
+        beyond = [Sketch.beyond(self.partial, trace.prefix(len(self.partial.labels)), self.theory)] if self.partial else []
+        for sketch in (*beyond, *Sketch.all_of(first, self.theory)):
+            later = zip(trace.actions[len(sketch.labels) - 1 :], trace.steps[len(sketch.labels) :], strict=True)
+            if all(sketch.extend(action, step) for action, step in later):
+                found = Found.of(sketch.map(), self.theory)
+                if (self.best is None or found.cost < self._cost) and (sketch.certain or not check(trace, found.map, self.theory)):
+                    self._keep(found, found.map.labels)
+                if sketch not in beyond:
+                    return
 
     def _minimise(self) -> Found | None:
         """A minimal map of the prefix, or None where it has no map. Better maps of the whole trace are kept on the way."""
@@ -496,6 +500,7 @@ class Search:
             minimal = None
             for found in self._candidates():
                 minimal = found
+                self.partial = found.map
                 replayed = self._log.replay(found.map.labels)
                 if replayed.outcome is Outcome.PREDICTED and (self.best is None or found.cost < self._cost):
                     self._keep(found, replayed.labels)

@@ -21,11 +21,14 @@ from ssh_abduction import encodings, facts
 from ssh_abduction.annealing import MORE, SECONDS, attempts
 from ssh_abduction.apart import Matrix
 from ssh_abduction.chart import FramedChart
+from ssh_abduction.localising import faced, states_of, tracked
 from ssh_abduction.merging import Told, merged_as_told, merged_near
 from ssh_abduction.nearby import mended
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
+FIRST_PAIRS = 200_000  # visits that may be one, of which the beginning of a long trace has so many that is guessed first
+LOST = 0.05  # of all visits, at most, if the beginning says where they are
 LOOSENED = 2  # so many travels, less one, from where a guess cannot be right its places are let free
 
 
@@ -78,7 +81,20 @@ class Streets:
         return bool(self.settled(chart, labels, single=True).solve().satisfiable)
 
     def guessed_labels(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
-        """Labels of a map of the causal axioms: one that has streets, as far as single ones tell, or where that is not soon found one of few dstates."""
+        """Labels of a map of the causal axioms: one that has streets, as far as single ones tell, or where that is not soon found one of few dstates.
+
+        Of a long trace the beginning is guessed, and the rest as that says; where that is no map, twice as many visits, and so on.
+        """
+        visits = chart.visits_with(FIRST_PAIRS)
+        while visits < len(chart.stars):
+            part = chart.beginning(visits)
+            if labels := self._continued(chart, part, self._guessed(part, check), check):
+                return labels
+            visits *= 2
+        return self._guessed(chart, check)
+
+    def _guessed(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
+        """The same, of visits that are guessed in one go."""
         began = time.thread_time()  # a thread may be made to wait
         apart = chart.apart()
         found: list[list[int]] = []
@@ -91,13 +107,25 @@ class Streets:
             maps = [(merged_near(apart, chart.links, start, check), start) for start in starts]
             ranked = sorted(maps, key=lambda pair: len(set(pair[0])))
             for _, start in ranked:
-                labels = merged_as_told(apart, chart.links, start, partial(self.told, chart), check)
-                if labels and self.has_single(chart, labels):
+                if labels := self._merged(chart, apart, start, check):
                     return labels
             found.append(ranked[0][0])
             if len(found) >= len(MORE) and time.thread_time() - began > SECONDS:
                 return min(found, key=lambda labels: len(set(labels)))
         raise AssertionError
+
+    def _continued(self, chart: FramedChart, part: FramedChart, known: Sequence[int], check: Callable[[], None]) -> list[int] | None:
+        """Such labels of all visits near those of a beginning, if these say where most visits are."""
+        states = tracked(chart, dict(enumerate(states_of(part, known))))
+        if states.count(-1) > LOST * len(states):
+            return None
+        start = [faced(states[visit], slot) if states[visit] >= 0 else -1 for visit, slot in chart.facing]
+        return self._merged(chart, chart.apart(), start, check)
+
+    def _merged(self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]) -> list[int] | None:
+        """Labels near these, which are -1 where they are not known, of a map that has streets, as far as single ones tell."""
+        labels = merged_as_told(apart, chart.links, start, partial(self.told, chart), check)
+        return labels if labels and self.has_single(chart, labels) else None
 
 
 def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:

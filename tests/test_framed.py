@@ -681,7 +681,7 @@ def test_a_guess_leaves_a_small_map_when_time_is_over() -> None:
         return asked(self, until)
 
     with (
-        patch.object(framed, "GUESS_FIRST", -1.0),
+        patch.multiple(framed, GUESS_FIRST=-1.0, SOON=-1.0),
         patch.object(FramedEngine, "_has_processors", lambda _: False),
         patch.object(FramedEngine, "_minimal_labels", interrupted),
     ):

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
+from itertools import pairwise
 from unittest.mock import patch
 
 import pytest
 
 from benchmarks.instances import Walk, maze
-from ssh_abduction import Search, Theory, same, solve
+from ssh_abduction import Search, Theory, same, solve, streets
 from ssh_abduction.chart import Chart, FramedChart, numbered
 from ssh_abduction.checker import check
 from ssh_abduction.framed import FramedEngine
-from ssh_abduction.localising import Located, State, faced, located
+from ssh_abduction.localising import Located, State, faced, located, tracked
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
+from ssh_abduction.streets import Streets
 
 FRAMED = Theory(star="frame")
 
@@ -93,3 +96,47 @@ def test_a_long_trace_is_solved_from_few_of_its_visits(seed: int) -> None:
     assert set(maps) == set(expected.maps)
     assert search.bound == expected.bound
     assert check(trace, maps[0], search.theory) == ()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_beginning_of_a_long_trace_is_guessed(seed: int) -> None:
+    """And the rest follows from it, or twice as many visits are guessed, until all are. Either way it is a map with streets."""
+    walk = maze(3, 3, steps=700, seed=seed, stars=True)
+    chart = charted(walk)
+    guessed: list[int] = []
+    begun = Streets._guessed
+
+    def counted(self: Streets, part: FramedChart, check: Callable[[], None]) -> list[int]:
+        guessed.append(len(part.stars))
+        return begun(self, part, check)
+
+    asked = Streets(walk.trace, FRAMED)
+    with patch.object(streets, "FIRST_PAIRS", 300), patch.object(Streets, "_guessed", counted):
+        found = asked.guessed_labels(chart, lambda: None)
+    assert guessed[0] < len(chart.stars) / 2
+    assert all(later == min(2 * earlier, len(chart.stars)) for earlier, later in pairwise(guessed))
+    assert chart.is_map(found)
+    assert asked.has_single(chart, found)
+    assert len(set(found)) <= 1.05 * len(set(walk.truth))
+
+
+def test_a_beginning_is_a_chart_of_fewer_steps() -> None:
+    walk = maze(3, 3, steps=200, seed=1, stars=True)
+    chart = charted(walk)
+    steps = next(t for t, node in enumerate(chart.node_of) if chart.facing[node][0] == 20)
+    part, expected = chart.beginning(20), Chart.framed(walk.trace, Log(walk.trace, FRAMED), steps)
+    assert part == expected
+    assert chart.beginning(len(chart.stars)) == chart
+
+
+def test_what_is_tracked_is_true() -> None:
+    """By a true map of a beginning; what leads elsewhere is not known."""
+    walk = maze(5, 5, steps=1000, seed=1, stars=True)
+    chart = charted(walk)
+    states = true_states(walk, chart)
+    assert max(states) > max(states[:60])
+    found = tracked(chart, dict(enumerate(states[:60])))
+    assert found[:60] == states[:60]
+    elsewhere = [i for i, state in enumerate(states) if state // 4 not in {known // 4 for known in states[:60]}]
+    assert sum(a == b for a, b in zip(found, states, strict=True)) > 0.8 * (len(states) - len(elsewhere))
+    assert any(found[i] == -1 for i in elsewhere)

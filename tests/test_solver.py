@@ -16,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 from hypothesis import given, settings
@@ -24,11 +25,13 @@ from worlds import TOURS, drive, rectangle, written
 
 import ssh_abduction.engine as engine_module
 import ssh_abduction.solver as solver_module
+from benchmarks.instances import maze
 from ssh_abduction import Progress, Search, SolverError, Speedups, SSHMap, Status, Theory, TheoryError, Trace, TraceError, solve
 from ssh_abduction.checker import check
 from ssh_abduction.errors import SSHError
 from ssh_abduction.explain import Interrupted, explain
 from ssh_abduction.facts import links_of
+from ssh_abduction.framed import FramedEngine
 from ssh_abduction.replay import Log, Outcome
 
 THEORIES = {"causal": Theory.causal(), "topological": Theory.topological(), "circumscriptive": Theory.circumscriptive()}
@@ -504,3 +507,22 @@ def test_renaming_and_mirroring_leave_the_maps_alone(case: tuple[Trace, Theory])
     mirrored = [{"name": a.name, "kind": a.kind, "turn": flip[a.turn]} for a in trace.actions]
     turned = [None if s is None else (s[0], s[3], s[2], s[1]) for s in stars] if stars else None
     assert {shape(m) for m in solve(Trace.from_steps(views, mirrored, stars=turned), theory, maps=0).maps} == shapes
+
+
+def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
+    """What it does not know is new: far fewer dstates than where hardly a prefix was mapped."""
+    trace = maze(4, 4, steps=900, seed=0, loops=0.5, stars=True).trace
+    grow = FramedEngine.grow
+    found = {}
+    for most in (8, 500):
+
+        def interrupted(self: FramedEngine, size: int, most: int = most) -> None:
+            if size > most:
+                raise KeyboardInterrupt
+            grow(self, size)
+
+        with patch.object(engine_module, "AT_ONCE", 500), patch.object(FramedEngine, "grow", interrupted):
+            found[most] = solve(trace)
+        assert found[most].stopped == "interrupted"
+        assert check(trace, found[most].maps[0], found[most].theory) == ()
+    assert len(found[500].maps[0].dstates) < 0.5 * len(found[8].maps[0].dstates)
