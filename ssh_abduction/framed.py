@@ -33,7 +33,7 @@ from ssh_abduction.engine import Found
 from ssh_abduction.merging import kept
 from ssh_abduction.nearby import Beside, NearbySearch
 from ssh_abduction.replay import Log
-from ssh_abduction.same import SECONDS_A_PAIR, Pair, SameEngine, TakesLong, smaller
+from ssh_abduction.same import SameEngine, TakesLong, smaller
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.streets import Streets
 from ssh_abduction.theory import Theory
@@ -401,11 +401,8 @@ class FramedEngine(SameEngine):
         self.ground_seconds += time.perf_counter() - began
         return True
 
-    def _begin(self, chart: FramedChart, fits: frozenset[Pair]) -> None:
-        super()._begin(chart, fits)
-        soon = SECONDS_A_PAIR * len(fits) > self._soon  # clingo will not have been told of them before
-        if soon and self._speedups.annealed and self._has_processors():
-            self._search_beside(chart)
+    def _begin(self, chart: FramedChart) -> None:
+        super()._begin(chart)
         self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # parts of sides.lp
 
     def _give(self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False) -> None:

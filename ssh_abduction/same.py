@@ -124,8 +124,8 @@ class SameEngine(ChartedEngine):
         """Whether clingo was told of all visits."""
         return len(self._visits) == len(self._chart.stars)
 
-    def _begin(self, chart: FramedChart, fits: frozenset[Pair]) -> None:
-        """Take a control that knows nothing, for visits of a chart of which these may be one."""
+    def _begin(self, chart: FramedChart) -> None:
+        """Take a control that knows nothing, for visits of a chart."""
         self._first_nodes = len(chart.seen)
         self._control = new_control("same", "", ["--heuristic=Domain"], self._speedups)
         self._batch = -1
@@ -152,7 +152,7 @@ class SameEngine(ChartedEngine):
         self._watch.check(SECONDS_A_PAIR * (len(fits) - known))
         size, self.size = self.size, 0  # until clingo was told all of it
         if anew:
-            self._begin(chart, fits)
+            self._begin(chart)
         else:
             self._control.release_external(facts.listed(self._batch))
         self._chart = chart
