@@ -477,7 +477,7 @@ class Search:
             self._keep(Found.of(found, theory), found.labels)
 
     def _sketch(self) -> None:
-        """Where nothing was found in time: some map of the whole trace, made without a search."""
+        """Where nothing was found in time: some map of the whole trace, made without a search; what goes on beyond that of a prefix, if it is better."""
         if not self._speedups.greedy or self.theory.without:
             return
         self._merge()
