@@ -19,7 +19,7 @@ from ssh_abduction.chart import FramedChart
 
 STRETCHES = 10  # of visits that are missed in one go
 
-State: TypeAlias = int  # 4 times the number of a place, and the slot of the place that slot 0 of a visit is
+State: TypeAlias = int  # 4 times the number of a place, 0 and up without gaps, and the slot of the place that slot 0 of a visit is
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,25 @@ def tracked(chart: FramedChart, states: Mapping[int, State]) -> list[State]:
 
 
 def states_of(chart: FramedChart, labels: Sequence[int]) -> list[State]:
-    """Of each visit 4 times the number of a place, and the slot of the place that slot 0 of the visit is. Visits that share a label are at one place."""
+    """The state of each visit. Visits that share a label are at one place."""
     at: dict[int, list[tuple[int, int]]] = {}  # visits and slots, by label
-    faced: dict[int, list[tuple[int, int]]] = {}  # slots and labels, by visit
+    labelled: dict[int, list[tuple[int, int]]] = {}  # slots and labels, by visit
     for (visit, slot), label in zip(chart.facing, labels, strict=True):
         at.setdefault(label, []).append((visit, slot))
-        faced.setdefault(visit, []).append((slot, label))
-    states: dict[int, int] = {}
-    for first in faced:
-        work = [] if first in states else [first]
-        states.setdefault(first, 4 * first)
+        labelled.setdefault(visit, []).append((slot, label))
+    states: dict[int, State] = {}
+    places = 0
+    for first in labelled:
+        if first in states:
+            continue
+        states[first] = 4 * places
+        places += 1
+        work = [first]
         for visit in work:
-            for slot, label in faced[visit]:
+            for slot, label in labelled[visit]:
                 for other, turned in at.pop(label, ()):
                     if other not in states:
-                        states[other] = states[visit] // 4 * 4 + (states[visit] + slot - turned) % 4
+                        states[other] = faced(states[visit], slot - turned)
                         work.append(other)
     return [states[visit] for visit in range(len(states))]
 

@@ -115,9 +115,8 @@ class SameEngine(ChartedEngine):
 
     def _first_visits(self, chart: FramedChart) -> set[int]:
         """The visits that clingo is told of first: all, unless too many may be one."""
-        if not self._speedups.lazy or chart.fitting[-1] <= FIRST_PAIRS:
-            return set(range(len(chart.stars)))
-        return {0, *range(chart.visits_with(FIRST_PAIRS)), *(chart.facing[node][0] for node in self.clique)}
+        first = chart.visits_with(FIRST_PAIRS) if self._speedups.lazy else len(chart.stars)
+        return {*range(first), *(chart.facing[node][0] for node in self.clique)}
 
     @property
     def _knows_all(self) -> bool:

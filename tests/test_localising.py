@@ -14,7 +14,7 @@ from ssh_abduction import Search, Theory, same, solve, streets
 from ssh_abduction.chart import Chart, FramedChart, numbered
 from ssh_abduction.checker import check
 from ssh_abduction.framed import FramedEngine
-from ssh_abduction.localising import Located, State, faced, located, tracked
+from ssh_abduction.localising import Located, State, faced, located, states_of, tracked
 from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.streets import Streets
@@ -140,3 +140,15 @@ def test_what_is_tracked_is_true() -> None:
     elsewhere = [i for i, state in enumerate(states) if state // 4 not in {known // 4 for known in states[:60]}]
     assert sum(a == b for a, b in zip(found, states, strict=True)) > 0.8 * (len(states) - len(elsewhere))
     assert any(found[i] == -1 for i in elsewhere)
+
+
+def test_places_of_labels_are_numbered_without_gaps() -> None:
+    """A state that no visit is at would fit anything."""
+    walk = maze(3, 3, steps=300, seed=1, stars=True)
+    chart = charted(walk)
+    truth = dict(zip(chart.node_of, walk.truth, strict=True))
+    states = states_of(chart, numbered(truth[node] for node in range(len(chart.seen))))
+    assert {state // 4 for state in states} == set(range(max(states) // 4 + 1))
+    turned: dict[int, int] = {}  # how the frame of each place is turned
+    for state, true in zip(states, true_states(walk, chart), strict=True):
+        assert turned.setdefault(state // 4, (true - state) % 4) == (true - state) % 4
