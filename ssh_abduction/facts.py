@@ -426,6 +426,11 @@ def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int
     return False, found["elsewhere"], found["one"]
 
 
+def is_violated(control: Control) -> bool:
+    """Whether no streets fit the labels of nodes, where that takes no choice to see."""
+    return control.symbolic_atoms[Function("violated")] is not None
+
+
 def loose(labels: Iterable[int]) -> str:
     """Dstates that may turn out to be others, as facts."""
     return "\n".join(f"loose({label})." for label in labels)

@@ -11,7 +11,8 @@ the *evidence* is how many merges that makes, and how often it confirms one made
 evidence, go first; then those with less, or with rivals that have clearly less. A step that fits none is a new dstate.
 
 What is guessed at can be finished in the same way: nodes that a guess has at one dstate are known to begin with, as far as they can be one.
-And the dstates of a map are thinned so: those seen least are merged with others, as long as that leaves a map.
+Where more is told on the way, of steps that are apart or one, the merge that leads to a contradiction is taken back.
+And the dstates of a map are thinned so: those seen least are merged with others, as long as that leaves a map, those with most evidence first.
 
 This is evidence-driven state merging (Lang, Pearlmutter, Price 1998, "Results of the Abbadingo One DFA Learning Competition") for one
 trace, from known dstates all over it rather than from a root.
@@ -19,7 +20,10 @@ trace, from known dstates all over it rather than from a root.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -31,7 +35,13 @@ from ssh_abduction.chart import Link, numbered
 # Least evidence for a merge, and how much it has to be ahead of the next; among how many known dstates at most:
 DEMANDS = ((10, 1), (5, 1), (5, 2), (3, 1), (3, 3), (2, 2), (2, 10), (1, 3), (1, 100), (0, 1), (0, 2), (0, 1000))
 
+THINNED = 10, 5, 3, 1  # least evidence for dstates of a map to be merged
+TAKEN_BACK = 20  # merges, after which there is no map,
+THIN_ENOUGH = 5  # and after which a map is thin enough
+
 Told: TypeAlias = tuple[Matrix, Sequence[tuple[int, int]]]  # which nodes are apart, and pairs that are one
+_State: TypeAlias = tuple[NDArray[np.int_], NDArray[np.bool_], Matrix, list[NDArray[np.int_]], list[dict[int, int]]]
+_Merge: TypeAlias = tuple[int, int]  # two steps whose classes become one; where they are one, that becomes known
 
 
 def merged(apart: Matrix, links: Iterable[Link], clique: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
@@ -42,7 +52,7 @@ def merged(apart: Matrix, links: Iterable[Link], clique: Sequence[int], check: C
     clique  nodes that are pairwise apart
     check   called now and then; may raise
     """
-    classes = _Classes(apart.copy(), links, clique)
+    classes = _Classes(apart, links, clique)
     classes.settle_all(check)
     return classes.labels()
 
@@ -62,15 +72,24 @@ def merged_as_told(
     links: Iterable[Link],
     guess: Sequence[int],
     tell: Callable[[Sequence[int], Sequence[int]], Told | None],
+    fits: Callable[[Sequence[int], Sequence[int]], bool],
     check: Callable[[], None] = lambda: None,
 ) -> list[int] | None:
-    """The same, where more is told on the way. None where that contradicts.
+    """The same, where more is told on the way, and thinned in the end. None where that contradicts, or no map is found soon.
 
     tell  is asked what follows from labels of all nodes, and which of these are still open, whenever they have changed; None: they contradict
+    fits  is asked whether they do not, sooner
     """
-    classes = _from_guess(apart, links, guess)
-    agrees = classes.settle_all(check, lambda: classes.heed(tell(classes.labels(), classes.unsettled().tolist())))
-    return classes.labels() if agrees else None
+    classes = _Heeding(apart, links, tell, fits, check)
+    classes.take(guess)
+    try:
+        classes.settle_all(check)
+    except _Contradicted:
+        return None
+    with suppress(_Contradicted):
+        classes.may_take_back = THIN_ENOUGH
+        classes.thin_all(check)
+    return classes.labels()
 
 
 def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int]:
@@ -84,21 +103,14 @@ def thinned(apart: Matrix, links: Iterable[Link], labels: Sequence[int], check: 
     Those seen at the fewest nodes are merged first, each with that for which the evidence is most. Parameters as above; the labels are those of a map.
     """
     classes = _from_guess(apart, links, labels)
-    nodes = np.bincount(classes.root)
-    for root in sorted(np.flatnonzero(classes.known).tolist(), key=lambda root: int(nodes[root])):
-        check()
-        if classes.known[root]:  # still
-            classes.thin(root)
+    classes.thin_all(check)
     return classes.labels()
 
 
 def _from_guess(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> _Classes:
     """Nodes that a guess has at one dstate are merged, as far as they can be one; what follows from that is merged, too."""
-    first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
-    classes = _Classes(apart.copy(), links, first.values())
-    for node, label in enumerate(guess):
-        if label >= 0:
-            classes.merge(first[label], node)
+    classes = _Classes(apart, links)
+    classes.take(guess)
     return classes
 
 
@@ -109,58 +121,68 @@ class _Classes:
     known  of each root, whether its class is a dstate of the map
     """
 
-    def __init__(self, apart: Matrix, links: Iterable[Link], known: Iterable[int]) -> None:
+    def __init__(self, apart: Matrix, links: Iterable[Link], known: Iterable[int] = ()) -> None:
         steps = len(apart)
         self.root = np.arange(steps)
         self.known = np.zeros(steps, dtype=bool)
         self.known[list(known)] = True
-        self._apart = apart  # of each root, the steps that are apart from some step of its class
+        self._apart = apart.copy()  # of each root, the steps that are apart from some step of its class
         self._members: list[NDArray[np.int_]] = [np.array([t]) for t in range(steps)]
         self._leads: list[dict[int, int]] = [{} for _ in range(steps)]  # of each root, by action
         for t, action, u in links:
             self._leads[t][action] = u
         self._undo: list[tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]] = []
+        self._made: list[_Merge] = []
+
+    def take(self, guess: Sequence[int]) -> None:
+        """Merge the nodes that a guess has at one dstate, as far as they can be one. These are known dstates."""
+        first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
+        self.known[list(first.values())] = True
+        for node, label in enumerate(guess):
+            if label >= 0:
+                self.merge(first[label], node)
 
     def labels(self) -> list[int]:
         """The class of each step, numbered by first step."""
         return numbered(self.root.tolist())
 
-    def settle_all(self, check: Callable[[], None], agrees: Callable[[], bool] = lambda: True) -> bool:
-        """Make every class a known dstate. Returns whether it agrees with what else is known, whenever some were."""
-        if not agrees():
-            return False
+    def settle_all(self, check: Callable[[], None]) -> None:
+        """Make every class a known dstate."""
         for evidence, rivals in DEMANDS:
-            while self.settle(evidence, rivals, check):
-                if not agrees():
-                    return False
-        while len(rest := self.unsettled()):
-            self.settle_at_any_rate(int(rest[0]))
+            while self._advanced(partial(self.settle, evidence, rivals, check)):
+                pass
+        while self._advanced(self.settle_at_any_rate):
             check()
-            if not agrees():
-                return False
-        return True
 
-    def heed(self, told: Told | None) -> bool:
-        """Keep what is told of steps apart, and merge those that are one, as far as they can be. Returns whether anything is told."""
-        if told is None:
-            return False
-        apart, one = told
-        self._apart |= apart
-        for root in np.flatnonzero(np.bincount(self.root) > 1):
-            self._apart[root] |= apart[self._members[root]].any(axis=0)
-        for a, b in one:
+    def thin_all(self, check: Callable[[], None]) -> None:
+        """Merge known dstates while there are some that can be one."""
+        for evidence in THINNED:
+            while self._advanced(partial(self.thin, evidence, check)):
+                pass
+
+    def _advanced(self, step: Callable[[], None]) -> bool:
+        """Take a step. Returns whether any merges were made."""
+        self._made = []
+        step()
+        return bool(self._made)
+
+    def make(self, merge: _Merge) -> None:
+        """Make two classes one, or a class known."""
+        a, b = (int(self.root[t]) for t in merge)
+        if a == b:
+            self.known[a] = True
+        else:
             self.merge(a, b, forced=True)
-        return True
+        self._made.append(merge)
 
     def unsettled(self) -> NDArray[np.int_]:
         """The steps of classes that are no known dstates."""
         return np.flatnonzero(~self.known[self.root])
 
-    def settle(self, evidence: int, rivals: int, check: Callable[[], None]) -> int:
-        """Merge unsettled classes with known dstates, as far as that evidence goes, or make them known. Returns how many."""
+    def settle(self, evidence: int, rivals: int, check: Callable[[], None]) -> None:
+        """Merge unsettled classes with known dstates, as far as that evidence goes, or make them known."""
         steps = self.unsettled()
         fitting = (~self._apart[np.flatnonzero(self.known)][:, steps]).sum(axis=0)
-        settled = 0
         for t in steps[np.argsort(fitting, kind="stable")].tolist():
             check()
             root = int(self.root[t])
@@ -171,28 +193,26 @@ class _Classes:
                 continue
             ranked = self._ranked(root, fits)
             if not ranked:
-                self.known[root] = True
-            elif ranked[0][0] < evidence + (ranked[1][0] if len(ranked) > 1 else 0):
-                continue
-            else:
-                self.merge(ranked[0][1], root)
-            settled += 1
-        return settled
+                self.make((root, root))
+            elif _is_ahead(ranked, evidence):
+                self.make((ranked[0][1], root))
 
-    def thin(self, root: int) -> None:
-        """Merge a known dstate with others, while it can be."""
-        while ranked := self._ranked(root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True):
-            self.merge(ranked[0][1], root, forced=True)
-            root = int(self.root[root])
+    def settle_at_any_rate(self) -> None:
+        """Merge the class of the first step that is not settled with the known dstate that most speaks for, if it fits any; or make it known."""
+        for t in self.unsettled()[:1].tolist():
+            root = int(self.root[t])
+            ranked = self._ranked(root, self._fitting(root))
+            self.make((ranked[0][1] if ranked else root, root))
 
-    def settle_at_any_rate(self, step: int) -> None:
-        """Merge the class of a step with the known dstate that most speaks for, if it fits any; or make it known."""
-        root = int(self.root[step])
-        ranked = self._ranked(root, self._fitting(root))
-        if ranked:
-            self.merge(ranked[0][1], root)
-        else:
-            self.known[root] = True
+    def thin(self, evidence: int, check: Callable[[], None]) -> None:
+        """Merge known dstates, those seen least first, as far as that evidence goes."""
+        nodes = np.bincount(self.root)
+        for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: int(nodes[root])):
+            check()
+            if self.known[root]:  # still
+                ranked = self._ranked(root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True)
+                if ranked and (evidence == THINNED[-1] or _is_ahead(ranked, evidence)):
+                    self.make((ranked[0][1], root))
 
     def _fitting(self, root: int) -> list[int]:
         """The known dstates that no step of the class is apart from."""
@@ -244,3 +264,87 @@ class _Classes:
             self._apart[a], self._leads[a], self._members[a], self.known[b] = apart, leads, members, known
             self.root[self._members[b]] = b
         self._undo = []
+
+
+class _Contradicted(Exception):  # noqa: N818 - not an error
+    """What is told contradicts, whatever is taken back."""
+
+
+class _Heeding(_Classes):
+    """Classes near a guess of which more is told whenever some were merged. The merges that contradict it are taken back."""
+
+    def __init__(
+        self,
+        apart: Matrix,
+        links: Iterable[Link],
+        tell: Callable[[Sequence[int], Sequence[int]], Told | None],
+        fits: Callable[[Sequence[int], Sequence[int]], bool],
+        check: Callable[[], None],
+    ) -> None:
+        super().__init__(apart, links)
+        self._tell = tell
+        self._fits = fits
+        self._check = check
+        self.may_take_back = TAKEN_BACK
+
+    def settle_all(self, check: Callable[[], None]) -> None:
+        if not self._heeds():
+            raise _Contradicted
+        super().settle_all(check)
+
+    def _advanced(self, step: Callable[[], None]) -> bool:
+        before = self._state()
+        advanced = super()._advanced(step)
+        if advanced and not self._heeds():
+            self._take_back_first_wrong(before, self._made)
+        return advanced
+
+    def _take_back_first_wrong(self, before: _State, made: Sequence[_Merge]) -> None:
+        """Make these merges anew up to the first that contradicts, whose classes are apart from now on."""
+
+        def fits(merges: int) -> bool:
+            self._check()
+            self._make_anew(before, made[:merges])
+            return self._fits(self.labels(), self.unsettled().tolist())
+
+        right = first_failing(fits, 1, len(made)) - 1
+        self._make_anew(before, made[:right])
+        self.may_take_back -= 1
+        a, b = (self._members[self.root[t]] for t in made[right])
+        if a is b or not self.may_take_back:
+            raise _Contradicted
+        self._apart[np.ix_(a, b)] = self._apart[np.ix_(b, a)] = True
+        self._apart[self.root[a[0]], b] = self._apart[self.root[b[0]], a] = True
+
+    def _make_anew(self, before: _State, merges: Iterable[_Merge]) -> None:
+        root, known, apart, members, leads = before
+        self.root, self.known, self._apart, self._members, self._leads = root.copy(), known.copy(), apart.copy(), list(members), list(leads)
+        for merge in merges:
+            self.make(merge)
+
+    def _state(self) -> _State:
+        return self.root.copy(), self.known.copy(), self._apart.copy(), list(self._members), list(self._leads)
+
+    def _heeds(self) -> bool:
+        """Keep what is told of steps apart, and merge those that are one, as far as they can be. Returns whether nothing contradicts."""
+        self._check()
+        told = self._tell(self.labels(), self.unsettled().tolist())
+        if told is None:
+            return False
+        apart, one = told
+        self._apart |= apart
+        for root in np.flatnonzero(np.bincount(self.root) > 1):
+            self._apart[root] |= apart[self._members[root]].any(axis=0)
+        for a, b in one:
+            self.merge(a, b, forced=True)
+        return True
+
+
+def first_failing(holds: Callable[[int], bool], first: int, last: int) -> int:
+    """The first of these numbers for which something does not hold, if it does not for those that follow either; the last is known to be one such."""
+    return first + bisect_left(range(first, last), True, key=lambda number: not holds(number))
+
+
+def _is_ahead(ranked: Sequence[tuple[int, int]], evidence: int) -> bool:
+    """Whether the first has that much more evidence than the next."""
+    return ranked[0][0] >= evidence + (ranked[1][0] if len(ranked) > 1 else 0)

@@ -4,13 +4,14 @@ What takes a choice of places and paths is asked by an engine, under its limits 
 time that no limit has to stop it.
 
 *A guess.* Visits are annealed (`annealing.py`). Where the guess cannot be right its places are let free, and what is there is merged by evidence
-(`merging.py`), while streets.lp says which visits cannot be one, and which have to be: so a guess becomes a map.
+(`merging.py`), while streets.lp says which visits cannot be one, and which have to be, and which merge leads to no streets: so a guess becomes a map.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -22,13 +23,16 @@ from ssh_abduction.annealing import MORE, SECONDS, attempts
 from ssh_abduction.apart import Matrix
 from ssh_abduction.chart import FramedChart
 from ssh_abduction.localising import faced, states_of, tracked
-from ssh_abduction.merging import Told, merged_as_told, merged_near
-from ssh_abduction.nearby import mended
+from ssh_abduction.merging import Told, first_failing, kept, merged_as_told, merged_near
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
-FIRST_PAIRS = 200_000  # visits that may be one, of which the beginning of a long trace has so many that is guessed first
+FIRST_PAIRS = (
+    200_000  # visits that may be one, of which the beginning of a trace that has more than twice as many has so many that is guessed first
+)
 LOST = 0.05  # of all visits, at most, if the beginning says where they are
+TRYING = 500  # conflicts after which it is left open whether there are single streets
+LEFT_OUT = 3  # places, at most, without which a guess has streets
 LOOSENED = 2  # so many travels, less one, from where a guess cannot be right its places are let free
 
 
@@ -76,9 +80,17 @@ class Streets:
         first = {label: node for node, label in reversed(list(enumerate(labels)))}
         return _apart(chart, labels, elsewhere), [(first[a], first[b]) for a, b in one]
 
-    def has_single(self, chart: FramedChart, labels: Sequence[int]) -> bool:
-        """Whether these labels have streets, as far as single ones tell."""
-        return bool(self.settled(chart, labels, single=True).solve().satisfiable)
+    def may_fit(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
+        """Whether these labels, which hold of all nodes but some, may be those of a map, as far as single streets tell."""
+        control = self.control(chart)
+        control.add("base", [], facts.settled_labels(enumerate(labels)))
+        control.ground([("base", [])])
+        return not facts.is_violated(control) and self.has_single(chart, labels, set(range(len(labels))).difference(loose)) is not False
+
+    def has_single(self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None) -> bool | None:
+        """Whether the labels of all nodes, or of these, have streets, as far as single ones tell. None where that is not soon known."""
+        options = [f"--solve-limit={TRYING}"]
+        return self.settled(chart, labels, options, nodes, single=True).solve().satisfiable
 
     def guessed_labels(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
         """Labels of a map of the causal axioms: one that has streets, as far as single ones tell, or where that is not soon found one of few dstates.
@@ -86,7 +98,7 @@ class Streets:
         Of a long trace the beginning is guessed, and the rest as that says; where that is no map, twice as many visits, and so on.
         """
         visits = chart.visits_with(FIRST_PAIRS)
-        while visits < len(chart.stars):
+        while visits < len(chart.stars) and chart.fitting[-1] > 2 * chart.fitting[visits]:
             part = chart.beginning(visits)
             if labels := self._continued(chart, part, self._guessed(part, check), check):
                 return labels
@@ -99,15 +111,11 @@ class Streets:
         apart = chart.apart()
         found: list[list[int]] = []
         for _, guess in attempts(replace(chart, elsewhere=()), check):
-            starts = [
-                mended(guess.labels(chart), chart),
-                guess.labels(chart),
-                *(guess.loosened(chart, travels).labels(chart) for travels in range(LOOSENED)),
-            ]
+            starts = [guess.loosened(chart, travels).labels(chart) for travels in range(LOOSENED)]
             maps = [(merged_near(apart, chart.links, start, check), start) for start in starts]
             ranked = sorted(maps, key=lambda pair: len(set(pair[0])))
             for _, start in ranked:
-                if labels := self._merged(chart, apart, start, check):
+                if labels := self.labels_near(chart, apart, start, check):
                     return labels
             found.append(ranked[0][0])
             if len(found) >= len(MORE) and time.thread_time() - began > SECONDS:
@@ -120,12 +128,50 @@ class Streets:
         if states.count(-1) > LOST * len(states):
             return None
         start = [faced(states[visit], slot) if states[visit] >= 0 else -1 for visit, slot in chart.facing]
-        return self._merged(chart, chart.apart(), start, check)
+        return self.labels_near(chart, chart.apart(), start, check)
 
-    def _merged(self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]) -> list[int] | None:
-        """Labels near these, which are -1 where they are not known, of a map that has streets, as far as single ones tell."""
-        labels = merged_as_told(apart, chart.links, start, partial(self.told, chart), check)
+    def labels_near(
+        self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None] = lambda: None
+    ) -> list[int] | None:
+        """Labels near these, which are -1 where they are not known, of a map that has streets, as far as single ones tell; None if none is soon found.
+
+        apart  which nodes are apart, nodes x nodes
+        check  called now and then; may raise
+        """
+        tell = partial(self._told_if_single, chart)
+        likely = self._likely(chart, apart, start, check)
+        labels = merged_as_told(apart, chart.links, likely, tell, partial(self.may_fit, chart), check) if likely else None
         return labels if labels and self.has_single(chart, labels) else None
+
+    def _told_if_single(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
+        """As `told`; None where the others have no streets either, as far as single ones tell."""
+        return self.told(chart, labels, loose) if self.may_fit(chart, labels, loose) else None
+
+    def _likely(self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]) -> list[int] | None:
+        """A guess without those of its places with which it has no streets, if they are few: -1 there."""
+        states = states_of(chart, kept(apart, chart.links, start))
+        visits = Counter(state // 4 for state in states)
+        # What was visited once cannot be wrong by itself, and hardly what was visited often.
+        places = sorted(visits, key=lambda place: (visits[place] > 1, -visits[place]))
+        left_out: set[int] = set()
+
+        def of_first(number: int) -> list[int]:
+            some = set(places[:number]) - left_out
+            return [label if states[visit] // 4 in some else -1 for label, (visit, _) in zip(start, chart.facing, strict=True)]
+
+        def agrees(number: int) -> bool:
+            check()
+            labels = of_first(number)
+            loose = [node for node, label in enumerate(labels) if label < 0]
+            return self.may_fit(chart, kept(apart, chart.links, labels), loose)
+
+        right = 0
+        while not agrees(len(places)):
+            if right == len(places) or len(left_out) == LEFT_OUT:
+                return None
+            right = first_failing(agrees, right + 1, len(places))
+            left_out.add(places[right - 1])
+        return of_first(len(places))
 
 
 def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from itertools import combinations
 from unittest.mock import patch
 
 import clingo
@@ -39,7 +39,7 @@ from ssh_abduction.checker import check
 from ssh_abduction.engine import Cost
 from ssh_abduction.framed import FramedEngine
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.merging import merged_as_told, merged_near
+from ssh_abduction.merging import kept, merged_near
 from ssh_abduction.nearby import Beside, NearbySearch
 from ssh_abduction.proof import check_bound
 from ssh_abduction.replay import Log
@@ -624,9 +624,7 @@ def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[
     chart = asked._chart
     apart = chart.apart()
     start = guess[: len(chart.seen)]
-    labels = (
-        merged_as_told(apart, chart.links, start, partial(asked._streets.told, chart)) if told else merged_near(apart, chart.links, start)
-    )
+    labels = asked._streets.labels_near(chart, apart, start) if told else merged_near(apart, chart.links, start)
     if labels is None:
         return
     assert chart.is_map(labels)
@@ -647,7 +645,33 @@ def test_a_true_guess_stays_as_it_is(seed: int) -> None:
     apart = chart.apart()
     assert merged_near(apart, chart.links, truth) == truth
     some = [-1 if 20 <= node < 60 else label for node, label in enumerate(truth)]
-    assert merged_as_told(apart, chart.links, some, partial(asked._streets.told, chart)) == truth
+    assert asked._streets.labels_near(chart, apart, some) == truth
+
+
+@pytest.mark.parametrize(("size", "steps", "seed"), [(5, 300, 0), (6, 300, 2), (8, 600, 1)])
+def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, seed: int) -> None:
+    """Where the causal axioms do not show that they are two, but streets do."""
+    walk = maze(size, size, steps=steps, seed=seed, stars=True)
+    asked = framed_engine(walk.trace, Theory.topological())
+    chart, known = asked._chart, asked._streets
+    truth = numbered([walk.truth[chart.node_of.index(node)] for node in range(len(chart.seen))])
+    apart = chart.apart()
+    nodes = np.array(truth)
+    rivals = [
+        (a, b)
+        for a, b in combinations(range(max(truth) + 1), 2)
+        if chart.seen[truth.index(a)] == chart.seen[truth.index(b)] and not apart[np.ix_(nodes == a, nodes == b)].any()
+    ]
+    wrong = [[a if label == b else label for label in truth] for a, b in rivals]
+    wrong = [guess for guess in wrong if len(set(kept(apart, chart.links, guess))) < len(set(truth))]
+    without_streets = [guess for guess in wrong if not known.may_fit(chart, kept(apart, chart.links, guess), [])]
+    assert without_streets
+    for guess in without_streets[:4]:
+        labels = known.labels_near(chart, apart, guess)
+        assert labels
+        assert chart.is_map(labels)
+        assert known.has_single(chart, labels)
+        assert len(set(labels)) <= len(set(truth))
 
 
 @pytest.mark.parametrize(("loops", "most"), [(0.1, 1.1), (0.3, 1.2)])
