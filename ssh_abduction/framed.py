@@ -41,8 +41,8 @@ from ssh_abduction.trace import Trace
 
 CLASHES = 30  # that clingo is told of in one go
 MANY_DSTATES = 50  # above which it is asked for single streets first
-ALL_STREETS = 20  # times as long as single ones, about, all take to ground
-PREPARED = 2.5  # times as long, until clasp has prepared to solve and can be stopped
+ALL_STREETS = 0.1  # times as long as single ones, about, for each dstate, all take to ground
+PREPARED = 3.5  # times as long, until clasp has prepared to solve and can be stopped
 MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much to say: some forty rules for each of them
 # clasp's way to list answers in which no atom that is shown can be spared:
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
@@ -348,7 +348,7 @@ class FramedEngine(SameEngine):
         control = self._streets.settled(self._chart, labels, options, nodes, single=single)
         self._watch.check()
         seconds = time.thread_time() - worked  # of this thread: the one beside may have made it wait
-        self._street_seconds = (self._street_seconds or ALL_STREETS * seconds) if single else seconds
+        self._street_seconds = (self._street_seconds or ALL_STREETS * len(set(labels)) * seconds) if single else seconds
         self.ground_seconds += time.perf_counter() - began
         return control
 

@@ -296,7 +296,7 @@ class _Heeding(_Classes):
         before = self._state()
         advanced = super()._advanced(step)
         if advanced and not self._heeds():
-            self._take_back_first_wrong(before, self._made)
+            self._take_back_first_wrong(before, tuple(self._made))
         return advanced
 
     def _take_back_first_wrong(self, before: _State, made: Sequence[_Merge]) -> None:
