@@ -35,7 +35,7 @@ from ssh_abduction.chart import Link, numbered
 # Least evidence for a merge, and how much it has to be ahead of the next; among how many known dstates at most:
 DEMANDS = ((10, 1), (5, 1), (5, 2), (3, 1), (3, 3), (2, 2), (2, 10), (1, 3), (1, 100), (0, 1), (0, 2), (0, 1000))
 
-THINNED = 10, 5, 3, 1  # least evidence for dstates of a map to be merged
+THINNED = 10, 5, 3, 0  # how much more evidence than for the next, for dstates of a map to be merged
 TAKEN_BACK = 20  # merges, after which there is no map,
 THIN_ENOUGH = 5  # and after which a map is thin enough
 
@@ -52,8 +52,9 @@ def merged(apart: Matrix, links: Iterable[Link], clique: Sequence[int], check: C
     clique  nodes that are pairwise apart
     check   called now and then; may raise
     """
-    classes = _Classes(apart, links, clique)
-    classes.settle_all(check)
+    classes = _Classes(apart, links, check)
+    classes.known[list(clique)] = True
+    classes.settle_all()
     return classes.labels()
 
 
@@ -62,8 +63,8 @@ def merged_near(apart: Matrix, links: Iterable[Link], guess: Sequence[int], chec
 
     guess  a label of each node; -1 where it is not known. Nodes that cannot be at one dstate with the others of their label leave it
     """
-    classes = _from_guess(apart, links, guess)
-    classes.settle_all(check)
+    classes = _from_guess(apart, links, guess, check)
+    classes.settle_all()
     return classes.labels()
 
 
@@ -83,12 +84,12 @@ def merged_as_told(
     classes = _Heeding(apart, links, tell, fits, check)
     classes.take(guess)
     try:
-        classes.settle_all(check)
+        classes.settle_all()
     except _Contradicted:
         return None
     with suppress(_Contradicted):
         classes.may_take_back = THIN_ENOUGH
-        classes.thin_all(check)
+        classes.thin_all()
     return classes.labels()
 
 
@@ -102,14 +103,14 @@ def thinned(apart: Matrix, links: Iterable[Link], labels: Sequence[int], check: 
 
     Those seen at the fewest nodes are merged first, each with that for which the evidence is most. Parameters as above; the labels are those of a map.
     """
-    classes = _from_guess(apart, links, labels)
-    classes.thin_all(check)
+    classes = _from_guess(apart, links, labels, check)
+    classes.thin_all()
     return classes.labels()
 
 
-def _from_guess(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> _Classes:
+def _from_guess(apart: Matrix, links: Iterable[Link], guess: Sequence[int], check: Callable[[], None] = lambda: None) -> _Classes:
     """Nodes that a guess has at one dstate are merged, as far as they can be one; what follows from that is merged, too."""
-    classes = _Classes(apart, links)
+    classes = _Classes(apart, links, check)
     classes.take(guess)
     return classes
 
@@ -121,11 +122,10 @@ class _Classes:
     known  of each root, whether its class is a dstate of the map
     """
 
-    def __init__(self, apart: Matrix, links: Iterable[Link], known: Iterable[int] = ()) -> None:
+    def __init__(self, apart: Matrix, links: Iterable[Link], check: Callable[[], None] = lambda: None) -> None:
         steps = len(apart)
         self.root = np.arange(steps)
         self.known = np.zeros(steps, dtype=bool)
-        self.known[list(known)] = True
         self._apart = apart.copy()  # of each root, the steps that are apart from some step of its class
         self._members: list[NDArray[np.int_]] = [np.array([t]) for t in range(steps)]
         self._leads: list[dict[int, int]] = [{} for _ in range(steps)]  # of each root, by action
@@ -133,6 +133,7 @@ class _Classes:
             self._leads[t][action] = u
         self._undo: list[tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]] = []
         self._made: list[_Merge] = []
+        self._check = check
 
     def take(self, guess: Sequence[int]) -> None:
         """Merge the nodes that a guess has at one dstate, as far as they can be one. These are known dstates."""
@@ -146,18 +147,18 @@ class _Classes:
         """The class of each step, numbered by first step."""
         return numbered(self.root.tolist())
 
-    def settle_all(self, check: Callable[[], None]) -> None:
+    def settle_all(self) -> None:
         """Make every class a known dstate."""
         for evidence, rivals in DEMANDS:
-            while self._advanced(partial(self.settle, evidence, rivals, check)):
+            while self._advanced(partial(self.settle, evidence, rivals)):
                 pass
         while self._advanced(self.settle_at_any_rate):
-            check()
+            self._check()
 
-    def thin_all(self, check: Callable[[], None]) -> None:
+    def thin_all(self) -> None:
         """Merge known dstates while there are some that can be one."""
         for evidence in THINNED:
-            while self._advanced(partial(self.thin, evidence, check)):
+            while self._advanced(partial(self.thin, evidence)):
                 pass
 
     def _advanced(self, step: Callable[[], None]) -> bool:
@@ -179,12 +180,12 @@ class _Classes:
         """The steps of classes that are no known dstates."""
         return np.flatnonzero(~self.known[self.root])
 
-    def settle(self, evidence: int, rivals: int, check: Callable[[], None]) -> None:
+    def settle(self, evidence: int, rivals: int) -> None:
         """Merge unsettled classes with known dstates, as far as that evidence goes, or make them known."""
         steps = self.unsettled()
         fitting = (~self._apart[np.flatnonzero(self.known)][:, steps]).sum(axis=0)
         for t in steps[np.argsort(fitting, kind="stable")].tolist():
-            check()
+            self._check()
             root = int(self.root[t])
             if self.known[root]:
                 continue
@@ -204,14 +205,14 @@ class _Classes:
             ranked = self._ranked(root, self._fitting(root))
             self.make((ranked[0][1] if ranked else root, root))
 
-    def thin(self, evidence: int, check: Callable[[], None]) -> None:
+    def thin(self, evidence: int) -> None:
         """Merge known dstates, those seen least first, as far as that evidence goes."""
         nodes = np.bincount(self.root)
         for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: int(nodes[root])):
-            check()
+            self._check()
             if self.known[root]:  # still
                 ranked = self._ranked(root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True)
-                if ranked and (evidence == THINNED[-1] or _is_ahead(ranked, evidence)):
+                if ranked and _is_ahead(ranked, evidence):
                     self.make((ranked[0][1], root))
 
     def _fitting(self, root: int) -> list[int]:
@@ -281,16 +282,15 @@ class _Heeding(_Classes):
         fits: Callable[[Sequence[int], Sequence[int]], bool],
         check: Callable[[], None],
     ) -> None:
-        super().__init__(apart, links)
+        super().__init__(apart, links, check)
         self._tell = tell
         self._fits = fits
-        self._check = check
         self.may_take_back = TAKEN_BACK
 
-    def settle_all(self, check: Callable[[], None]) -> None:
+    def settle_all(self) -> None:
         if not self._heeds():
             raise _Contradicted
-        super().settle_all(check)
+        super().settle_all()
 
     def _advanced(self, step: Callable[[], None]) -> bool:
         before = self._state()

@@ -1,7 +1,7 @@
 """Questions to streets.lp: what order and sides say of the dstates of a trace whose places have frames, and which guesses they let be maps.
 
-What takes a choice of places and paths is asked by an engine, under its limits (`framed.py`). What is asked here takes none, and so little
-time that no limit has to stop it.
+What takes a choice of places and paths is asked by an engine, under its limits (`framed.py`). What is asked here takes none, or hardly any: so little
+time that some conflicts are limit enough.
 
 *A guess.* Visits are annealed (`annealing.py`). Where the guess cannot be right its places are let free, and what is there is merged by evidence
 (`merging.py`), while streets.lp says which visits cannot be one, and which have to be, and which merge leads to no streets: so a guess becomes a map.
@@ -27,9 +27,7 @@ from ssh_abduction.merging import Told, first_failing, kept, merged_as_told, mer
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
 
-FIRST_PAIRS = (
-    200_000  # visits that may be one, of which the beginning of a trace that has more than twice as many has so many that is guessed first
-)
+FIRST_PAIRS = 200_000  # visits that may be one, of the beginning that is guessed first, where a trace has more than twice as many
 LOST = 0.05  # of all visits, at most, if the beginning says where they are
 TRYING = 500  # conflicts after which it is left open whether there are single streets
 LEFT_OUT = 3  # places, at most, without which a guess has streets
@@ -85,12 +83,15 @@ class Streets:
         control = self.control(chart)
         control.add("base", [], facts.settled_labels(enumerate(labels)))
         control.ground([("base", [])])
-        return not facts.is_violated(control) and self.has_single(chart, labels, set(range(len(labels))).difference(loose)) is not False
+        return not facts.is_violated(control) and self._may_have_single(chart, labels, loose)
 
     def has_single(self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None) -> bool | None:
         """Whether the labels of all nodes, or of these, have streets, as far as single ones tell. None where that is not soon known."""
         options = [f"--solve-limit={TRYING}"]
         return self.settled(chart, labels, options, nodes, single=True).solve().satisfiable
+
+    def _may_have_single(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
+        return self.has_single(chart, labels, set(range(len(labels))).difference(loose)) is not False
 
     def guessed_labels(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
         """Labels of a map of the causal axioms: one that has streets, as far as single ones tell, or where that is not soon found one of few dstates.
@@ -145,7 +146,8 @@ class Streets:
 
     def _told_if_single(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
         """As `told`; None where the others have no streets either, as far as single ones tell."""
-        return self.told(chart, labels, loose) if self.may_fit(chart, labels, loose) else None
+        told = self.told(chart, labels, loose)
+        return told if told and self._may_have_single(chart, labels, loose) else None
 
     def _likely(self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]) -> list[int] | None:
         """A guess without those of its places with which it has no streets, if they are few: -1 there."""
