@@ -28,7 +28,7 @@ FRAMED = ["full taylor-hall", SMALL.name, "full maze 5x5 n=1600", "full maze 10x
 USED = {
     "causal": {"prefixes", "names", "clique", "apart", "lazy", "core_guided", "annealed", "watched", "one_by_one", "threads", "greedy"},
     "full": {"prefixes", "path_names", "from_below", "framing", "ways"},
-    "framed": {"prefixes", "names", "clique", "lazy", "core_guided", "small_cores", "sides", "annealed", "watched", "threads"},
+    "framed": {"prefixes", "names", "clique", "lazy", "core_guided", "small_cores", "sides", "annealed", "watched", "threads", "processes"},
 }
 
 

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, TypeVar
 
@@ -22,6 +22,7 @@ RESERVE = 0.2  # share of the time limit kept for finding any map of the whole t
 POLL = 0.05  # seconds between looks at the clock and for Ctrl-C
 TICK = 0.5  # seconds between reports of progress while clingo is busy
 
+_grounding = threading.Lock()
 _under_way: set[clingo.SolveHandle] = set()  # searches of clingo's, each in a thread
 
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
@@ -56,7 +57,7 @@ class Watch:
     def __init__(
         self,
         limit: float | None = None,
-        memory: int | None = None,
+        memory: float | None = None,
         on_tick: Callable[[], None] = lambda: None,
         *,
         beside: Watch | None = None,
@@ -129,6 +130,12 @@ class Watch:
             return False
         return not seconds or self._beside is None or self._beside.left() >= seconds
 
+    def memory_left(self) -> float | None:
+        """MiB until the memory limit, of which other processes may use as much."""
+        if self._memory is None:
+            return self._beside.memory_left() if self._beside else None
+        return self._memory - peak_memory()
+
     def left(self) -> float:
         """Seconds until the time limit."""
         return math.inf if self._limit is None else self._limit - self.elapsed()
@@ -136,6 +143,11 @@ class Watch:
 
 def peak_memory() -> float:
     """The most memory this process has used, in MiB."""
+    with (
+        suppress(OSError, StopIteration),
+        open("/proc/self/status", "rb") as status,
+    ):  # on Linux getrusage counts what the process that began this one used
+        return next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:")) / 2**10
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -170,6 +182,22 @@ Answer = TypeVar("Answer")
 Made = TypeVar("Made")
 
 
+class Control(clingo.Control):
+    """A control, of which one at a time reads and grounds: side by side, threads wait for each other at each symbol, which takes three times as long."""
+
+    def load(self, path: str) -> None:
+        with _grounding:
+            super().load(path)
+
+    def add(self, *program: Any) -> None:
+        with _grounding:
+            super().add(*program)
+
+    def ground(self, parts: Sequence[tuple[str, Sequence[clingo.Symbol]]] = (("base", ()),), context: Any = None) -> None:
+        with _grounding:
+            super().ground(parts, context)
+
+
 class Asker:
     """One clingo control, and the questions to it.
 
@@ -181,7 +209,7 @@ class Asker:
         self.ground_seconds = 0.0
         self.solve_seconds = 0.0
         self._watch = watch
-        self._control = clingo.Control(["--warn=none"])
+        self._control: clingo.Control = Control(["--warn=none"])
 
     @property
     def grounding(self) -> Grounding:
@@ -307,7 +335,7 @@ def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
 
 def new_control(encoding: str, base: str, options: Sequence[str], speedups: Speedups) -> clingo.Control:
     """A control with an encoding, and these facts in its base."""
-    control = clingo.Control(["--warn=none", *options])
+    control = Control(["--warn=none", *options])
     control.load(encodings.path(encoding))
     control.add("base", [], base if speedups.watched else f"{base}\n{facts.watched()}.")
     control.ground([("base", [])])

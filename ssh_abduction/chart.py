@@ -17,7 +17,7 @@ one node, linked by rotations both ways. Nodes are apart if that follows from wh
 from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
@@ -144,6 +144,10 @@ class FramedChart(Chart):
     stars: tuple[tuple[int, ...], ...]
     travels: tuple[Link, ...]
     elsewhere: Collection[tuple[int, int]] = ()
+
+    def __getstate__(self) -> dict[str, object]:
+        """To another process goes what is given, and not the large arrays that were made of it."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def apart(self, most: int | None = None, others: Sequence[int] | None = None) -> NDArray[np.bool_]:
         """Which pairs of nodes, of the first `most` if so many are given, are apart, or which of them and these others, nodes x others:

@@ -10,7 +10,7 @@ a lower bound, and if some answer of that cost has streets, all minimal maps are
 that are one. If no single street does, or visits are too many for that, streets.lp is asked which labels clash: smallest sets of nodes at
 dstates that no streets fit; same.lp is told that these do not go together. As every map of the full theory keeps that, bounds still hold.
 
-*Beside.* What takes long is guessed in another thread, and the guess made a map (`streets.py`). Near it, maps are made here, while there it is
+*Beside.* What takes long is guessed in another process, and the guess made a map (`streets.py`). Near it, maps are made here, while there it is
 proven with names, from the guess outwards, how many dstates the causal axioms need (`nearby.py`). Where a map has so few, it has the fewest;
 and the same names then list all ways to be at so few. Some of them fit no frame, which streets.lp sees, or have no streets; but each map of the
 full theory is among them.
@@ -19,7 +19,7 @@ full theory is among them.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import chain, combinations, islice
@@ -27,11 +27,12 @@ from itertools import chain, combinations, islice
 import clingo
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.asking import POLL, Watch, mapped
+from ssh_abduction.asking import Watch, mapped
 from ssh_abduction.chart import Chart, FramedChart, NoFrame, numbered
 from ssh_abduction.engine import Found
 from ssh_abduction.merging import kept
 from ssh_abduction.nearby import Beside, NearbySearch
+from ssh_abduction.process import in_process
 from ssh_abduction.replay import Log
 from ssh_abduction.same import SameEngine, TakesLong, smaller
 from ssh_abduction.speedups import Speedups
@@ -49,7 +50,7 @@ SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 KEPT = 10  # controls of minimal namings that are kept until their maps are listed: each is some megabytes
 SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside, mostly
 GUESS_FIRST = 5.0  # the same, where that has to be done first
-LATER = 4  # times as long, where clingo was not told of all visits: then that is waited for,
+LATER = 4  # times as long, where clingo was not told of all visits,
 LATER_SHARE = 0.25  # or so much of the time limit, if that is less
 GUESSES = 20  # labels that are tried, near what annealing guesses
 GUESSING = 1000  # conflicts after which better streets of these are no longer sought
@@ -158,17 +159,15 @@ class FramedEngine(SameEngine):
             return self._labels_beside() is not None or (self._known is not None and self.bound == len(set(self._known)))
         if not self._speedups.annealed:
             return False
-        waited = self._watch.elapsed()
-        soon = self._soon if self._knows_all else min(LATER * self._soon, LATER_SHARE * (waited + self._watch.left()))
+        waited, soon = self._watch.elapsed(), self._soon
         if not self._beside and waited > soon and self._has_processors():
             self._search_beside(self._chart)
-        while self._beside and self._beside.running and self._guess is None and not self._knows_all:
-            self._watch.check()  # both are much Python, of which one thread runs at a time
-            time.sleep(POLL)
+        if not self._knows_all:
+            soon = min(LATER * soon, LATER_SHARE * (waited + self._watch.left()))
         return self._guess is not None or (not self._beside and waited > max(soon, GUESS_FIRST))
 
     def _search_beside(self, chart: FramedChart) -> None:
-        """Begin to guess in another thread, and to prove from there that the causal axioms need so many dstates."""
+        """Begin to guess beside this, and to prove from there that the causal axioms need so many dstates."""
         watch, pinned = Watch(beside=self._watch), self.clique or [0]
         apart = chart.apart(others=pinned)
         self._named = NearbySearch(
@@ -180,11 +179,14 @@ class FramedEngine(SameEngine):
             far=None,
         )
 
-        self._beside = Beside(self._named, watch, self._fewer_labels(self._named, chart, watch.check))
+        self._beside = Beside(self._named, watch, self._fewer_labels(self._named, chart, watch))
 
-    def _fewer_labels(self, named: NearbySearch, chart: FramedChart, check: Callable[[], None]) -> Iterator[list[int]]:
+    def _fewer_labels(self, named: NearbySearch, chart: FramedChart, watch: Watch) -> Iterator[list[int]]:
         """Labels, each time fewer, of maps of the causal axioms near a guess."""
-        self._guess = self._streets.guessed_labels(chart, check)
+        if self._speedups.processes:
+            self._guess = in_process(_guessed_labels, self._streets, chart, watch=watch)
+        else:
+            self._guess = self._streets.guessed_labels(chart, watch.check)
         yield from named.fewer(self._guess)
 
     def map_of_guess(self) -> Found | None:
@@ -234,11 +236,11 @@ class FramedEngine(SameEngine):
                 yield from self._news_beside()
             elif self._known and len(set(labels)) >= len(set(self._known)):
                 break
-            elif not (yield from self._known_if_it_has_streets(labels)):
-                self._forbid(labels)
+            elif not (fits := (yield from self._known_if_it_has_streets(labels))):
                 failed += 1
-                if failed == GUESSES:
+                if fits is None or failed == GUESSES:
                     break
+                self._forbid(labels)
         yield from self._bettered()
 
     def _bettered(self) -> Iterator[Found]:
@@ -260,9 +262,13 @@ class FramedEngine(SameEngine):
             return None
         return labels
 
-    def _known_if_it_has_streets(self, labels: Sequence[int]) -> Generator[Found, None, bool]:
-        """The map of these labels, from now on the known one, if any streets fit them. Returns whether they do."""
-        found, _ = self._some_streets(labels)
+    def _known_if_it_has_streets(self, labels: Sequence[int]) -> Generator[Found, None, bool | None]:
+        """The map of these labels, from now on the known one, if any streets fit them. Returns whether they do; None if there is no time to see that."""
+        found = self._soon_streets(labels)
+        if found is None:
+            if not self._watch.allows(self._preparing):
+                return None
+            found, _ = self._all_streets(labels)
         if found is None:
             return False
         self._known, self._known_cost = tuple(numbered(labels)), found.cost
@@ -297,16 +303,17 @@ class FramedEngine(SameEngine):
             self._forbid(refused)
 
     def _some_streets(self, labels: Sequence[int]) -> tuple[Found | None, _Naming]:
-        """A map with these dstates, if any streets fit them.
+        """A map with these dstates, if any streets fit them."""
+        found = self._soon_streets(labels)
+        return (found, _Naming(list(labels), None)) if found else self._all_streets(labels)
 
-        Where dstates are many it is asked first whether there is one in which no two places or stretches are taken for one.
-        """
-        naming = _Naming(list(labels), None)
-        if len(set(labels)) > MANY_DSTATES:
-            found = self._single_streets(labels)
-            if found is not None:
-                return found, naming
-        naming = replace(naming, control=self._street_control(labels))
+    def _soon_streets(self, labels: Sequence[int]) -> Found | None:
+        """A map with these dstates, where they are many and there is one in which no two places or stretches are taken for one."""
+        return self._single_streets(labels) if len(set(labels)) > MANY_DSTATES else None
+
+    def _all_streets(self, labels: Sequence[int]) -> tuple[Found | None, _Naming]:
+        """A map with these dstates, if any streets fit them, and a control for all of them."""
+        naming = _Naming(list(labels), self._street_control(labels))
         return next(self._maps(naming, "ignore"), None), naming
 
     def _single_streets(self, labels: Sequence[int]) -> Found | None:
@@ -436,3 +443,7 @@ class FramedEngine(SameEngine):
         self._watch.check()
         _, elsewhere, _ = next(self._answers(facts.read_told, "ignore", 1, control=control))
         return replace(chart, elsewhere=elsewhere)
+
+
+def _guessed_labels(streets: Streets, chart: FramedChart, watch: Watch) -> list[int]:
+    return streets.guessed_labels(chart, watch.check)

@@ -31,7 +31,7 @@ checker finds consistent; or a sketch of all steps. Where places have frames, a 
 something new. clingo is asked again when the trace is longer by RETRY and PAUSE; it goes on where it was stopped, and may prove a map minimal
 again.
 
-Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`guessing.py`), one after another, in a thread
+Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`guessing.py`), one after another, in a process
 of their own, and mended there where that takes longer than a step may.
 """
 
@@ -130,12 +130,8 @@ class OnlineMapper:
         Raises TraceError where the step does not fit theory and trace; the mapper stays as it was.
         """
         began = time.perf_counter()
-        self._let_guess(False)
-        try:
-            self._take(Action.of(action), view, star, began)
-            self.solution = self._answer(began)
-        finally:
-            self._let_guess(True)
+        self._take(Action.of(action), view, star, began)
+        self.solution = self._answer(began)
         return self.solution
 
     def _take(self, action: Action, view: View, star: Sequence[float] | None, began: float) -> None:
@@ -214,13 +210,6 @@ class OnlineMapper:
 
     def _rank(self, sketch: Sketch) -> tuple[int, ...]:
         return Cost.of(sketch.map()).preferred_by(self.theory)
-
-    def _let_guess(self, may_run: bool) -> None:
-        """Let a guess go on while the robot drives, and not where it would hold up a step."""
-        if self._guess and may_run:
-            self._guess.may_run.set()
-        elif self._guess:
-            self._guess.may_run.clear()
 
     def _may_guess(self) -> bool:
         """Whether a small map is wanted, and the steps are not too many to be compared in pairs."""

@@ -28,6 +28,7 @@ class Speedups:
     watched      with names or frames: make constraints of three literals longer, so that clasp watches two of them rather than all three
     one_by_one   with names: where that stalls, ask for numbers of dstates one by one
     threads      with names or frames: two threads, where a trace is hard and there are two processors
+    processes    with frames: a guess is made in a process of its own, where there are two processors
     greedy       some map without a search, for a time limit that leaves no other; in the causal theory a small one where clingo takes its time
     """
 
@@ -47,6 +48,7 @@ class Speedups:
     watched: bool = True
     one_by_one: bool = True
     threads: bool = True
+    processes: bool = True
     greedy: bool = True
 
     @classmethod

@@ -21,6 +21,7 @@ import numpy as np
 from ssh_abduction import encodings, facts
 from ssh_abduction.annealing import MORE, SECONDS, attempts
 from ssh_abduction.apart import Matrix
+from ssh_abduction.asking import Control
 from ssh_abduction.chart import FramedChart
 from ssh_abduction.localising import faced, states_of, tracked
 from ssh_abduction.merging import Told, first_failing, kept, merged_as_told, merged_near
@@ -43,7 +44,7 @@ class Streets:
 
     def control(self, chart: FramedChart, options: Sequence[str] = ()) -> clingo.Control:
         """A control with these axioms, and what happened; nothing is grounded yet."""
-        control = clingo.Control(["--warn=none", *options])
+        control = Control(["--warn=none", *options])
         control.load(encodings.path("streets"))
         control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
         return control

@@ -27,7 +27,7 @@ from typing import TypeAlias
 import clingo
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.asking import Watch, mapped
+from ssh_abduction.asking import Control, Watch, mapped
 from ssh_abduction.chart import Link, numbered
 from ssh_abduction.engine import Found
 from ssh_abduction.named import NamedEngine, Settled
@@ -193,7 +193,7 @@ class WaysEngine(NamedEngine):
         parts: Iterable[str] = ("base", "least"),
     ) -> clingo.Control:
         """A control for the places and paths of dstates that are linked so, and of these."""
-        control = clingo.Control(["--warn=none", *options])
+        control = Control(["--warn=none", *options])
         control.load(encodings.path("courses"))
         control.load(encodings.path("preference"))
         dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links)))

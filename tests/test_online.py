@@ -251,7 +251,7 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
     assert without < 5 < contradicted
 
 
-@pytest.mark.parametrize("off", ["annealed", "threads"])
+@pytest.mark.parametrize("off", ["annealed", "threads", "processes"])
 def test_nothing_is_guessed_where_that_is_switched_off(off: str) -> None:
     trace = maze(2, 2, steps=60, seed=0, stars=True).trace
     with patch.object(online, "GUESSED", 10):

@@ -1,0 +1,84 @@
+"""Work in a process of its own. Python runs but one thread at a time, and clingo grounds about one at a time; a second process has the second processor to itself."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from typing import IO, TypeVar
+
+from ssh_abduction.asking import POLL, Stopped, Watch
+
+Result = TypeVar("Result")
+
+_SERVE = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from ssh_abduction.process import serve; serve()"
+
+
+def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) -> Result:
+    """What `work` makes of these arguments, and of a watch, which comes last. It is done here, if there can be no other process.
+
+    work, arguments  picklable; so are the result, and what work raises
+    watch            may end the process. What it leaves of the memory limit is that of the other one
+
+    Raises Stopped, also where something from outside ends the process.
+    """
+    code = 1
+    if "python" in os.path.basename(sys.executable or "").lower():  # and not a program that has Python inside
+        with suppress(OSError), tempfile.TemporaryFile() as answer:
+            code = _run(work, arguments, watch, answer)
+            if code == 0:
+                answer.seek(0)
+                result, error = pickle.load(answer)
+                if error is not None:
+                    raise error
+                return result  # type: ignore[no-any-return]
+    if code < 0:
+        raise Stopped("memory limit")  # else nobody ends it
+    return work(*arguments, watch)
+
+
+def _run(work: Callable[..., object], arguments: tuple[object, ...], watch: Watch, answer: IO[bytes]) -> int:
+    """The exit code of a process that writes its answer to this file. It ends as its input does, should this process end first."""
+    with subprocess.Popen([sys.executable, "-c", _SERVE], stdin=subprocess.PIPE, stdout=answer, stderr=subprocess.DEVNULL) as process:
+        assert process.stdin
+        try:
+            with suppress(BrokenPipeError):
+                for sent in (sys.path, (work, arguments, watch.memory_left())):
+                    pickle.dump(sent, process.stdin)
+                process.stdin.flush()
+            while process.poll() is None:
+                watch.check()
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(POLL)
+        finally:
+            process.kill()
+    return process.returncode
+
+
+def serve() -> None:
+    """Do the work that comes in, and write its result, or what it raised, to the output."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is meant for the process that waits for this one
+    work, arguments, memory = pickle.load(sys.stdin.buffer)
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    watch = Watch(memory=memory)
+    watch.start()
+    with os.fdopen(os.dup(1), "wb") as output:
+        os.dup2(2, 1)  # nothing else is written there
+        try:
+            answer: tuple[object, Exception | None] = work(*arguments, watch), None
+        except Exception as error:
+            answer = None, error
+        pickle.dump(answer, output)
+    os._exit(0)
+
+
+def _end_with_input() -> None:
+    while os.read(0, 1):
+        pass
+    os._exit(1)

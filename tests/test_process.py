@@ -1,0 +1,143 @@
+"""Work in a process of its own gives what it gives here, and ends when it is no longer wanted."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+from instances import maze
+
+from ssh_abduction import Theory, framed
+from ssh_abduction.asking import Stopped, Watch, peak_memory
+from ssh_abduction.chart import Chart
+from ssh_abduction.process import in_process
+from ssh_abduction.replay import Log
+from ssh_abduction.streets import Streets
+
+
+def started(limit: float | None = None, memory: int | None = None) -> Watch:
+    watch = Watch(limit, memory)
+    watch.use_reserve()
+    watch.start()
+    return watch
+
+
+def double_and_tell_where(values: list[int], watch: Watch) -> tuple[list[int], int]:
+    print("not part of the answer")
+    watch.check()
+    return [2 * value for value in values], os.getpid()
+
+
+def fail(message: str, _: Watch) -> None:
+    raise ValueError(message)
+
+
+def write_again_and_again(path: Path, watch: Watch) -> None:
+    for number in range(10**9):
+        watch.check()
+        path.write_text(str(number))
+        time.sleep(0.01)
+
+
+def end_at_once(_: Watch) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def use_memory(mebibytes: int, watch: Watch) -> int:
+    held = []
+    for _ in range(mebibytes):
+        held.append(b"x" * 2**20)
+        watch.check()
+    return len(held)
+
+
+def is_written(path: Path) -> bool:
+    before = path.stat().st_mtime_ns
+    time.sleep(0.3)
+    return path.stat().st_mtime_ns != before
+
+
+def test_the_result_comes_from_another_process() -> None:
+    values = list(range(100_000))  # more than a pipe holds
+    doubled, process = in_process(double_and_tell_where, values, watch=started())
+    assert doubled == [2 * value for value in values]
+    assert process != os.getpid()
+
+
+@pytest.mark.parametrize("executable", ["", None, "/usr/bin/robot", "/nowhere/python"])
+def test_where_no_process_can_be_had_work_is_done_here(executable: str | None) -> None:
+    with patch.object(sys, "executable", executable):
+        assert in_process(double_and_tell_where, [1, 2], watch=started()) == ([2, 4], os.getpid())
+
+
+def test_what_work_raises_is_raised_here() -> None:
+    with pytest.raises(ValueError, match="twice nothing"):
+        in_process(fail, "twice nothing", watch=started())
+
+
+def test_what_ends_the_search_ends_the_process(tmp_path: Path) -> None:
+    path = tmp_path / "written"
+    watch = started()
+
+    def interrupt() -> None:
+        while not path.exists():
+            time.sleep(0.01)
+        watch.interrupted = True
+
+    waiting = threading.Thread(target=interrupt)
+    waiting.start()
+    with pytest.raises(Stopped, match="interrupted"):
+        in_process(write_again_and_again, path, watch=watch)
+    waiting.join()
+    assert not is_written(path)
+
+
+def test_a_process_ends_with_the_one_that_waits_for_it(tmp_path: Path) -> None:
+    path = tmp_path / "written"
+    program = f"""
+from pathlib import Path
+from ssh_abduction.asking import Watch
+from ssh_abduction.process import in_process
+from test_process import write_again_and_again
+in_process(write_again_and_again, Path({str(path)!r}), watch=Watch())
+"""
+    with subprocess.Popen([sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}) as waiting:
+        while not path.exists():
+            assert waiting.poll() is None
+            time.sleep(0.01)
+        assert is_written(path)
+        waiting.kill()
+    time.sleep(0.1)
+    assert not is_written(path)
+
+
+def test_a_process_that_is_killed_stops_the_search() -> None:
+    with pytest.raises(Stopped):
+        in_process(end_at_once, watch=started())
+
+
+def test_what_is_left_of_the_memory_is_that_of_the_process() -> None:
+    """Not what this one has used."""
+    held = b"x" * (300 * 2**20)
+    beside = Watch(beside=started(memory=int(peak_memory()) + 200))
+    beside.start()
+    assert in_process(use_memory, 10, watch=beside) == 10
+    with pytest.raises(Stopped, match="memory"):
+        in_process(use_memory, 400, watch=beside)
+    del held
+
+
+def test_a_guess_is_the_same_in_another_process() -> None:
+    trace = maze(3, 3, steps=300, seed=1, stars=True).trace
+    theory = Theory.topological().resolve(trace)
+    streets, chart = Streets(trace, theory), Chart.framed(trace, Log(trace, theory))
+    assert chart.misfits.any()  # which does not go along
+    here = streets.guessed_labels(chart, lambda: None)
+    assert in_process(framed._guessed_labels, streets, chart, watch=started()) == here
