@@ -1,4 +1,4 @@
-"""Work in a process of its own. Python runs but one thread at a time, and clingo grounds about one at a time; a second process has the second processor to itself."""
+"""Work in a process of its own, which has a processor to itself: of the threads of one process but one runs Python at a time, and but one grounds."""
 
 from __future__ import annotations
 
@@ -74,6 +74,8 @@ def serve() -> None:
             answer: tuple[object, Exception | None] = work(*arguments, watch), None
         except Exception as error:
             answer = None, error
+        output.seek(0)
+        output.truncate()  # something may have greeted there as Python began
         pickle.dump(answer, output)
     os._exit(0)
 

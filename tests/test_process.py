@@ -71,6 +71,14 @@ def test_the_result_comes_from_another_process() -> None:
     assert process != os.getpid()
 
 
+def test_what_else_is_written_is_not_part_of_the_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "sitecustomize.py").write_text("print('good morning' * 1000)")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    doubled, process = in_process(double_and_tell_where, [1, 2], watch=started())
+    assert doubled == [2, 4]
+    assert process != os.getpid()
+
+
 @pytest.mark.parametrize("executable", ["", None, "/usr/bin/robot", "/nowhere/python"])
 def test_where_no_process_can_be_had_work_is_done_here(executable: str | None) -> None:
     with patch.object(sys, "executable", executable):
