@@ -48,7 +48,8 @@ MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much 
 # clasp's way to list answers in which no atom that is shown can be spared:
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 KEPT = 10  # controls of minimal namings that are kept until their maps are listed: each is some megabytes
-SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside, mostly
+SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside,
+SOON_SHARE = 0.05  # or so much of a longer time limit, if that is less
 GUESS_FIRST = 5.0  # the same, where that has to be done first
 LATER = 4  # times as long, where clingo was not told of all visits,
 LATER_SHARE = 0.25  # or so much of the time limit, if that is less
@@ -68,7 +69,7 @@ class _Naming:
 class FramedEngine(SameEngine):
     """The full theory with frames, fewest dstates first.
 
-    soon  seconds without the fewest dstates after which a map near a guess is sought beside; SOON if not given
+    soon  seconds without the fewest dstates after which a map near a guess is sought beside, at most; SOON if not given
     """
 
     lists_least = True
@@ -159,12 +160,13 @@ class FramedEngine(SameEngine):
             return self._labels_beside() is not None or (self._known is not None and self.bound == len(set(self._known)))
         if not self._speedups.annealed:
             return False
-        waited, soon = self._watch.elapsed(), self._soon
+        waited = self._watch.elapsed()
+        limit = waited + self._watch.left()
+        soon = min(self._soon, SOON_SHARE * limit) if limit > self._soon else self._soon
         if not self._beside and waited > soon and self._has_processors():
             self._search_beside(self._chart)
-        if not self._knows_all:
-            soon = min(LATER * soon, LATER_SHARE * (waited + self._watch.left()))
-        return self._guess is not None or (not self._beside and waited > max(soon, GUESS_FIRST))
+        later = self._soon if self._knows_all else min(LATER * self._soon, LATER_SHARE * limit)
+        return self._guess is not None or (not self._beside and waited > max(later, GUESS_FIRST))
 
     def _search_beside(self, chart: FramedChart) -> None:
         """Begin to guess beside this, and to prove from there that the causal axioms need so many dstates."""

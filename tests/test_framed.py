@@ -674,6 +674,25 @@ def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, s
         assert len(set(labels)) <= len(set(truth))
 
 
+@pytest.mark.parametrize(
+    ("limit", "waited", "begins"),
+    [(None, 2.9, False), (None, 3.1, True), (60, 2.9, False), (60, 3.1, True), (10, 0.4, False), (10, 0.6, True), (0.5, 0.4, False)],
+)
+def test_a_guess_begins_sooner_under_a_short_limit(limit: float | None, waited: float, begins: bool) -> None:
+    """But not where there is no time for one, as at a step of the online mapper."""
+    asked = framed_engine(maze(2, 2, steps=20, seed=0, stars=True).trace, Theory.topological())
+    asked._visits = set()
+    if limit is not None:
+        asked._watch.shorten(limit)
+    with (
+        patch.object(FramedEngine, "_has_processors", lambda _: True),
+        patch.object(FramedEngine, "_search_beside") as begun,
+        patch.object(Watch, "elapsed", lambda _: waited),
+    ):
+        assert not asked._has_news()
+    assert begun.called == begins
+
+
 def test_labels_that_take_too_long_to_try_are_left() -> None:
     """Where no single streets fit them, and there is no time to ground all; the search goes on."""
     walk = maze(3, 3, steps=200, seed=0, stars=True)
