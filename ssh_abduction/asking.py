@@ -142,11 +142,8 @@ class Watch:
 
 
 def peak_memory() -> float:
-    """The most memory this process has used, in MiB."""
-    with (
-        suppress(OSError, StopIteration),
-        open("/proc/self/status", "rb") as status,
-    ):  # on Linux getrusage counts what the process that began this one used
+    """The most memory this process has used, in MiB. On Linux getrusage begins with what the process that began this one used."""
+    with suppress(OSError, StopIteration), open("/proc/self/status", "rb") as status:
         return next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:")) / 2**10
     import resource
 
