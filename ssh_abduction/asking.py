@@ -180,7 +180,10 @@ Made = TypeVar("Made")
 
 
 class Control(clingo.Control):
-    """A control, of which one at a time reads and grounds: side by side, threads wait for each other at each symbol, which takes three times as long."""
+    """A control without warnings. One at a time reads and grounds: side by side, threads wait for each other at each symbol, which takes three times as long."""
+
+    def __init__(self, options: Sequence[str] = ()) -> None:
+        super().__init__(["--warn=none", *options])
 
     def load(self, path: str) -> None:
         with _grounding:
@@ -206,7 +209,7 @@ class Asker:
         self.ground_seconds = 0.0
         self.solve_seconds = 0.0
         self._watch = watch
-        self._control: clingo.Control = Control(["--warn=none"])
+        self._control = Control()
 
     @property
     def grounding(self) -> Grounding:
@@ -330,9 +333,9 @@ def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
     return result
 
 
-def new_control(encoding: str, base: str, options: Sequence[str], speedups: Speedups) -> clingo.Control:
+def new_control(encoding: str, base: str, options: Sequence[str], speedups: Speedups) -> Control:
     """A control with an encoding, and these facts in its base."""
-    control = Control(["--warn=none", *options])
+    control = Control(options)
     control.load(encodings.path(encoding))
     control.add("base", [], base if speedups.watched else f"{base}\n{facts.watched()}.")
     control.ground([("base", [])])

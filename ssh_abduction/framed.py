@@ -147,7 +147,7 @@ class FramedEngine(SameEngine):
             except TakesLong:
                 if not self._guessed:
                     self._guessed = True
-                    yield from self._guesses(self._guess or self._streets.guessed_labels(self._chart, self._watch.check))
+                    yield from self._guesses(self._guess or self._streets.guessed_labels(self._chart, self._watch))
                 else:
                     yield from self._news_beside()
                     yield from self._bettered()
@@ -185,10 +185,8 @@ class FramedEngine(SameEngine):
 
     def _fewer_labels(self, named: NearbySearch, chart: FramedChart, watch: Watch) -> Iterator[list[int]]:
         """Labels, each time fewer, of maps of the causal axioms near a guess."""
-        if self._speedups.processes:
-            self._guess = in_process(_guessed_labels, self._streets, chart, watch=watch)
-        else:
-            self._guess = self._streets.guessed_labels(chart, watch.check)
+        guessed_labels = self._streets.guessed_labels
+        self._guess = in_process(guessed_labels, chart, watch=watch) if self._speedups.processes else guessed_labels(chart, watch)
         yield from named.fewer(self._guess)
 
     def map_of_guess(self) -> Found | None:
@@ -197,7 +195,7 @@ class FramedEngine(SameEngine):
             self._chart = self._charted(len(self._trace))
         except NoFrame:
             return None
-        return self._single_streets(self._streets.guessed_labels(self._chart, self._watch.check))
+        return self._single_streets(self._streets.guessed_labels(self._chart, self._watch))
 
     def map_mended_from(self, known: Sequence[int]) -> Found | None:
         """A map of the whole trace in which the first steps keep these dstates, as far as can be, and all else is new, if that has streets."""
@@ -445,7 +443,3 @@ class FramedEngine(SameEngine):
         self._watch.check()
         _, elsewhere, _ = next(self._answers(facts.read_told, "ignore", 1, control=control))
         return replace(chart, elsewhere=elsewhere)
-
-
-def _guessed_labels(streets: Streets, chart: FramedChart, watch: Watch) -> list[int]:
-    return streets.guessed_labels(chart, watch.check)

@@ -11,7 +11,7 @@ import tempfile
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import IO, TypeVar
+from typing import TypeVar
 
 from ssh_abduction.asking import POLL, Stopped, Watch
 
@@ -28,24 +28,27 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
 
     Raises Stopped, also where something from outside ends the process.
     """
-    code = 1
-    if "python" in os.path.basename(sys.executable or "").lower():  # and not a program that has Python inside
-        with suppress(OSError), tempfile.TemporaryFile() as answer:
-            code = _run(work, arguments, watch, answer)
-            if code == 0:
-                answer.seek(0)
-                result, error = pickle.load(answer)
-                if error is not None:
-                    raise error
-                return result  # type: ignore[no-any-return]
+    code, answer = _run(work, arguments, watch)
+    if code == 0:
+        answered: tuple[Result, Exception | None] = pickle.loads(answer)
+        result, error = answered
+        if error is not None:
+            raise error
+        return result
     if code < 0:
         raise Stopped("memory limit")  # else nobody ends it
     return work(*arguments, watch)
 
 
-def _run(work: Callable[..., object], arguments: tuple[object, ...], watch: Watch, answer: IO[bytes]) -> int:
-    """The exit code of a process that writes its answer to this file. It ends as its input does, should this process end first."""
-    with subprocess.Popen([sys.executable, "-c", _SERVE], stdin=subprocess.PIPE, stdout=answer, stderr=subprocess.DEVNULL) as process:
+def _run(work: Callable[..., object], arguments: tuple[object, ...], watch: Watch) -> tuple[int, bytes]:
+    """The exit code of a process, and what it wrote. It ends as its input does, should this process end first."""
+    if "python" not in os.path.basename(sys.executable or "").lower():  # a program that has Python inside
+        return 1, b""
+    with (
+        suppress(OSError),
+        tempfile.TemporaryFile() as answer,
+        subprocess.Popen([sys.executable, "-c", _SERVE], stdin=subprocess.PIPE, stdout=answer, stderr=subprocess.DEVNULL) as process,
+    ):
         assert process.stdin
         try:
             with suppress(BrokenPipeError):
@@ -58,7 +61,9 @@ def _run(work: Callable[..., object], arguments: tuple[object, ...], watch: Watc
                     process.wait(POLL)
         finally:
             process.kill()
-    return process.returncode
+        answer.seek(0)
+        return process.returncode, answer.read()
+    return 1, b""
 
 
 def serve() -> None:
@@ -67,7 +72,6 @@ def serve() -> None:
     work, arguments, memory = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_end_with_input, daemon=True).start()
     watch = Watch(memory=memory)
-    watch.start()
     with os.fdopen(os.dup(1), "wb") as output:
         os.dup2(2, 1)  # nothing else is written there
         try:

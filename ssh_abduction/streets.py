@@ -21,7 +21,7 @@ import numpy as np
 from ssh_abduction import encodings, facts
 from ssh_abduction.annealing import MORE, SECONDS, attempts
 from ssh_abduction.apart import Matrix
-from ssh_abduction.asking import Control
+from ssh_abduction.asking import Control, Watch
 from ssh_abduction.chart import FramedChart
 from ssh_abduction.localising import faced, states_of, tracked
 from ssh_abduction.merging import Told, first_failing, kept, merged_as_told, merged_near
@@ -44,7 +44,7 @@ class Streets:
 
     def control(self, chart: FramedChart, options: Sequence[str] = ()) -> clingo.Control:
         """A control with these axioms, and what happened; nothing is grounded yet."""
-        control = Control(["--warn=none", *options])
+        control = Control(options)
         control.load(encodings.path("streets"))
         control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
         return control
@@ -94,7 +94,7 @@ class Streets:
     def _may_have_single(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
         return self.has_single(chart, labels, set(range(len(labels))).difference(loose)) is not False
 
-    def guessed_labels(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
+    def guessed_labels(self, chart: FramedChart, watch: Watch) -> list[int]:
         """Labels of a map of the causal axioms: one that has streets, as far as single ones tell, or where that is not soon found one of few dstates.
 
         Of a long trace the beginning is guessed, and the rest as that says; where that is no map, twice as many visits, and so on.
@@ -102,10 +102,10 @@ class Streets:
         visits = chart.visits_with(FIRST_PAIRS)
         while visits < len(chart.stars) and chart.fitting[-1] > 2 * chart.fitting[visits]:
             part = chart.beginning(visits)
-            if labels := self._continued(chart, part, self._guessed(part, check), check):
+            if labels := self._continued(chart, part, self._guessed(part, watch.check), watch.check):
                 return labels
             visits *= 2
-        return self._guessed(chart, check)
+        return self._guessed(chart, watch.check)
 
     def _guessed(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
         """The same, of visits that are guessed in one go."""

@@ -193,7 +193,7 @@ class WaysEngine(NamedEngine):
         parts: Iterable[str] = ("base", "least"),
     ) -> clingo.Control:
         """A control for the places and paths of dstates that are linked so, and of these."""
-        control = Control(["--warn=none", *options])
+        control = Control(options)
         control.load(encodings.path("courses"))
         control.load(encodings.path("preference"))
         dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links)))

@@ -734,7 +734,7 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, mo
             yield wrong, guess
 
     with patch.object(annealing, "ANNEALED", ((0.5, 100),)), patch.object(streets, "attempts", counted):
-        labels = asked._streets.guessed_labels(chart, lambda: None)
+        labels = asked._streets.guessed_labels(chart, Watch())
     assert failed[0] > 0
     assert asked._streets.has_single(chart, labels)
     assert len(set(labels)) < most * len(set(walk.truth))

@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks.instances import Walk, maze
 from ssh_abduction import Search, Theory, same, solve, streets
+from ssh_abduction.asking import Watch
 from ssh_abduction.chart import Chart, FramedChart, numbered
 from ssh_abduction.checker import check
 from ssh_abduction.framed import FramedEngine
@@ -112,7 +113,7 @@ def test_the_beginning_of_a_long_trace_is_guessed(seed: int) -> None:
 
     asked = Streets(walk.trace, FRAMED)
     with patch.object(streets, "FIRST_PAIRS", 300), patch.object(Streets, "_guessed", counted):
-        found = asked.guessed_labels(chart, lambda: None)
+        found = asked.guessed_labels(chart, Watch())
     assert guessed[0] < len(chart.stars) / 2
     assert all(later in {2 * earlier, len(chart.stars)} for earlier, later in pairwise(guessed))
     assert chart.is_map(found)

@@ -14,19 +14,12 @@ from unittest.mock import patch
 import pytest
 from instances import maze
 
-from ssh_abduction import Theory, framed
+from ssh_abduction import Theory
 from ssh_abduction.asking import Stopped, Watch, peak_memory
 from ssh_abduction.chart import Chart
 from ssh_abduction.process import in_process
 from ssh_abduction.replay import Log
 from ssh_abduction.streets import Streets
-
-
-def started(limit: float | None = None, memory: int | None = None) -> Watch:
-    watch = Watch(limit, memory)
-    watch.use_reserve()
-    watch.start()
-    return watch
 
 
 def double_and_tell_where(values: list[int], watch: Watch) -> tuple[list[int], int]:
@@ -66,7 +59,7 @@ def is_written(path: Path) -> bool:
 
 def test_the_result_comes_from_another_process() -> None:
     values = list(range(100_000))  # more than a pipe holds
-    doubled, process = in_process(double_and_tell_where, values, watch=started())
+    doubled, process = in_process(double_and_tell_where, values, watch=Watch())
     assert doubled == [2 * value for value in values]
     assert process != os.getpid()
 
@@ -74,7 +67,7 @@ def test_the_result_comes_from_another_process() -> None:
 def test_what_else_is_written_is_not_part_of_the_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "sitecustomize.py").write_text("print('good morning' * 1000)")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    doubled, process = in_process(double_and_tell_where, [1, 2], watch=started())
+    doubled, process = in_process(double_and_tell_where, [1, 2], watch=Watch())
     assert doubled == [2, 4]
     assert process != os.getpid()
 
@@ -82,17 +75,17 @@ def test_what_else_is_written_is_not_part_of_the_answer(tmp_path: Path, monkeypa
 @pytest.mark.parametrize("executable", ["", None, "/usr/bin/robot", "/nowhere/python"])
 def test_where_no_process_can_be_had_work_is_done_here(executable: str | None) -> None:
     with patch.object(sys, "executable", executable):
-        assert in_process(double_and_tell_where, [1, 2], watch=started()) == ([2, 4], os.getpid())
+        assert in_process(double_and_tell_where, [1, 2], watch=Watch()) == ([2, 4], os.getpid())
 
 
 def test_what_work_raises_is_raised_here() -> None:
     with pytest.raises(ValueError, match="twice nothing"):
-        in_process(fail, "twice nothing", watch=started())
+        in_process(fail, "twice nothing", watch=Watch())
 
 
 def test_what_ends_the_search_ends_the_process(tmp_path: Path) -> None:
     path = tmp_path / "written"
-    watch = started()
+    watch = Watch()
 
     def interrupt() -> None:
         while not path.exists():
@@ -128,14 +121,13 @@ in_process(write_again_and_again, Path({str(path)!r}), watch=Watch())
 
 def test_a_process_that_is_killed_stops_the_search() -> None:
     with pytest.raises(Stopped):
-        in_process(end_at_once, watch=started())
+        in_process(end_at_once, watch=Watch())
 
 
 def test_what_is_left_of_the_memory_is_that_of_the_process() -> None:
     """Not what this one has used."""
     held = b"x" * (300 * 2**20)
-    beside = Watch(beside=started(memory=int(peak_memory()) + 200))
-    beside.start()
+    beside = Watch(beside=Watch(memory=peak_memory() + 200))
     assert in_process(use_memory, 10, watch=beside) == 10
     with pytest.raises(Stopped, match="memory"):
         in_process(use_memory, 400, watch=beside)
@@ -147,5 +139,5 @@ def test_a_guess_is_the_same_in_another_process() -> None:
     theory = Theory.topological().resolve(trace)
     streets, chart = Streets(trace, theory), Chart.framed(trace, Log(trace, theory))
     assert chart.misfits.any()  # which does not go along
-    here = streets.guessed_labels(chart, lambda: None)
-    assert in_process(framed._guessed_labels, streets, chart, watch=started()) == here
+    here = streets.guessed_labels(chart, Watch())
+    assert in_process(streets.guessed_labels, chart, watch=Watch()) == here
