@@ -54,23 +54,18 @@ class Evidence:
     views    what was seen at the first steps of the trace, and
     actions  what was done, both as numbers
     bound    so many dstates every map has, as far as is proven
-    found    steps that are pairwise apart, if the search had need of them; then no views are given
     """
 
     views: tuple[int, ...]
     actions: tuple[int, ...]
     bound: int
-    found: tuple[int, ...] = ()
 
     @cached_property
     def certificate(self) -> Certificate:
-        clique = self.found or self._clique()
+        from ssh_abduction.apart import Continuations  # loads numpy, which takes longer than to solve a short trace
+
+        clique = tuple(Continuations(self.views, self.actions).clique())
         return Certificate(clique, tuple(range(len(clique), self.bound)))
-
-    def _clique(self) -> tuple[int, ...]:
-        from ssh_abduction.apart import apartness, clique  # loads numpy, which takes longer than to solve a short trace
-
-        return tuple(clique(apartness(self.views, self.actions), self.views))
 
 
 def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from ssh_abduction.apart import Continuations
+
 Link: TypeAlias = tuple[int, int, int]  # node, action, node
 QUARTERS: dict[TurnDirection | None, int] = {"right": 1, "around": 2, "left": 3}
 
@@ -55,12 +57,16 @@ class Chart:
         """The chart of the first steps, each a node."""
         return Chart(tuple(log.seen[:size]), tuple((t, log.actions[t], t + 1) for t in range(size - 1)), range(size))
 
-    def apart(self, most: int | None = None) -> NDArray[np.bool_]:
-        """Which pairs of nodes, of the first `most` if so many are given, are apart: nodes x nodes."""
-        from ssh_abduction.apart import apartness  # loads numpy
+    def apart(self) -> NDArray[np.bool_]:
+        """Which pairs of nodes are apart: nodes x nodes."""
+        return self.continuations.apart()
 
-        seen = self.seen[:most]
-        return apartness(seen, [action for _, action, _ in self.links[: len(seen) - 1]])
+    @cached_property
+    def continuations(self) -> Continuations:
+        """How the trace goes on from each node."""
+        from ssh_abduction.apart import Continuations  # loads numpy
+
+        return Continuations(self.seen, [action for _, action, _ in self.links])
 
     def is_map(self, labels: Sequence[int]) -> bool:
         """Whether the labels of all nodes are those of a map: each dstate shows one view, and each action leads to one dstate."""
@@ -153,7 +159,7 @@ class FramedChart(Chart):
         """Which pairs of nodes, of the first `most` if so many are given, are apart, or which of them and these others, nodes x others:
         no frame has both visits so turned that the two nodes are one dstate.
 
-        As in `apartness`, from the last visit to the first: visits do not fit if they show different things, or if the same action,
+        From the last visit to the first: visits do not fit if they show different things, or if the same action,
         done facing the same way, leads to visits that do not fit as they are.
         """
         import numpy as np

@@ -1,8 +1,8 @@
 """A small map of the causal theory without a search: steps are merged where much speaks for it, in the order of how much.
 
->>> from ssh_abduction.apart import apartness
+>>> from ssh_abduction.apart import Continuations
 >>> from ssh_abduction.merging import merged
->>> merged(apartness([0, 1, 0, 1], [0, 0, 0]), [(0, 0, 1), (1, 0, 2), (2, 0, 3)], [0, 1])
+>>> merged(Continuations([0, 1, 0, 1], [0, 0, 0]).apart(), [(0, 0, 1), (1, 0, 2), (2, 0, 3)], [0, 1])
 [0, 1, 0, 1]
 
 Steps that are apart are known dstates to begin with. To merge two steps means to merge what the same actions lead to from them, and so on:

@@ -37,11 +37,10 @@ from typing import Any, TypeAlias
 
 import clingo
 import numpy as np
-from numpy.typing import NDArray
 
 from ssh_abduction import facts
 from ssh_abduction.annealing import annealed, annealed_steps
-from ssh_abduction.apart import apart_from, clique, far_apart
+from ssh_abduction.apart import Matrix
 from ssh_abduction.asking import POLL, Stopped, Watch, new_control
 from ssh_abduction.chart import Chart, Link, NoFrame, numbered
 from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found
@@ -58,6 +57,7 @@ SPARES = 2  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
 CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
 GUESSES = 10  # that are waited for until one is a map, where the robot does not turn
+WHOLE = 100_000  # steps of which a clique is pinned at once
 TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside that
 
 
@@ -89,6 +89,10 @@ class NamedEngine(ChartedEngine):
     def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
         return NamedEngine(trace, self._theory, watch, log, self._speedups)
 
+    @property
+    def whole(self) -> int:
+        return WHOLE
+
     def grow(self, size: int) -> None:
         if size == self.size:
             return
@@ -103,13 +107,11 @@ class NamedEngine(ChartedEngine):
         began = time.perf_counter()
         self.size = size
         self._chart = Chart.of_steps(self._log, size)
-        seen = self._chart.seen
-        apart = self._chart.apart(AT_ONCE)
+        continuations = self._chart.continuations
+        self.clique = continuations.clique() if self._speedups.clique else [0]
         self._watch.check()
-        self.clique = clique(apart, seen[:AT_ONCE]) if self._speedups.clique else [0]
-        columns = apart[:, self.clique] if len(seen) <= AT_ONCE else self._columns(self.clique)
-        self._may_be = [(~row).nonzero()[0].tolist() for row in columns]
-        self._far = far_apart(apart, seen, self._log.actions[: size - 1]) if self._speedups.apart and len(seen) <= AT_ONCE else None
+        pinned = np.stack([continuations.apart_from(step) for step in self.clique], axis=1)
+        self._may_be = [(~row).nonzero()[0].tolist() for row in pinned]
         self._one_by_one = self._hard = False
         self._known = None
         self._spares = self._first_spares()
@@ -125,9 +127,9 @@ class NamedEngine(ChartedEngine):
         """How many spare names each view has, to begin with."""
         return dict.fromkeys(self._chart.seen, SPARES)
 
-    def _columns(self, nodes: Sequence[int]) -> NDArray[np.bool_]:
-        """The columns of these nodes in the matrix of apart nodes, where that is too large."""
-        return np.stack([apart_from(self._chart.seen, self._log.actions[: self.size - 1], t) for t in nodes], axis=1)
+    def _far(self, node: int) -> Matrix:
+        """Which nodes are apart from this one, as more than one action shows."""
+        return self._chart.continuations.apart_from(node, actions=2)
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         for labels in self._better_labels():
@@ -234,21 +236,21 @@ class NamedEngine(ChartedEngine):
             chart=self._chart,
             clique=self.clique,
             may_be=self._may_be,
-            far=self._far,
+            far=self._far if self._speedups.apart else None,
             configuration="tweety",
         )
 
     def _merged(self, check: Callable[[], None]) -> Iterator[list[int]]:
         """Labels of a map merged by evidence."""
         if self._speedups.greedy:
-            yield merged(self._chart.apart(AT_ONCE), self._chart.links, self.clique, check)
+            yield merged(self._chart.apart(), self._chart.links, self.clique, check)
 
     def _near_guess(self, search: NearbySearch, check: Callable[[], None], tries: int | None = None) -> Iterator[list[int]]:
         """Labels of a map that is guessed, and of those near that."""
         guess = self._guessed(check) if self._speedups.annealed else None
         if guess is None:
             return
-        apart, links = self._chart.apart(AT_ONCE), self._chart.links
+        apart, links = self._chart.apart(), self._chart.links
         known = thinned(apart, links, merged_near(apart, links, guess, check), check)
         del apart  # as large as steps x steps
         yield from search.fewer(known, tries)
@@ -467,7 +469,7 @@ class NamedEngine(ChartedEngine):
                 given.append((t, view, self._choices[t], self._last.get(view)))
                 if len(self._choices[t]) > 1:
                     self._last[view] = t
-                    far += [(t, int(u)) for u in np.flatnonzero(self._far[t] & self._open)] if self._far is not None else []
+                    far += [(t, int(u)) for u in np.flatnonzero(self._far(t) & self._open)] if self._speedups.apart else []
                     self._open[t] = True
         self._links.update(dict.fromkeys(added))
         part, batch = f"batch_{self._batches}", self._batches

@@ -25,7 +25,7 @@ import random
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import Any, Literal, TypeAlias
 
@@ -66,7 +66,7 @@ class NearbySearch(Asker):
         chart: Chart,
         clique: Sequence[int],
         may_be: Sequence[Sequence[int]],
-        far: Matrix | None,
+        far: Callable[[int], Matrix] | None,
         configuration: str | None = None,
     ) -> None:
         super().__init__(watch)
@@ -169,7 +169,7 @@ class NearbySearch(Asker):
                 nodes.append((t, seen[t], self._choices[t], last.get(seen[t])))
                 if t not in pinned:
                     last[seen[t]] = t
-            far = [(t, int(u)) for t in new for u in np.flatnonzero(self._far[t, :t])] if self._far is not None else []
+            far = [(t, int(u)) for t in new for u in np.flatnonzero(self._far(t)[:t])] if self._far is not None else []
             self._control.add(part, [], facts.batch_facts(batch, nodes, added, far))
             self._control.ground([(part, []), ("more", facts.numbers(batch))])
         self._watch.check(PREPARING * (time.perf_counter() - began))

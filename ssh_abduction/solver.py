@@ -367,15 +367,12 @@ class Search:
         )
 
     def _evidence(self, size: int) -> Evidence | None:
-        """What shows that no map has fewer dstates: of the first `size` steps, and of AT_ONCE at most."""
+        """What shows that no map has fewer dstates: of the first `size` steps."""
         if RESTS_ON & set(self.theory.without):
             return None
-        proven = self.bound.dstates or 0
-        if self._engine.clique and self.theory.level == "causal":  # in other theories more than actions and views tells nodes apart
-            return Evidence((), (), proven, tuple(self._engine.clique))
         number: dict[object, int] = {}
-        views = tuple(number.setdefault(step.view, len(number)) for step in self.trace.steps[: min(max(size, 1), AT_ONCE)])
-        return Evidence(views, tuple(self._log.actions[: len(views) - 1]), proven)
+        views = tuple(number.setdefault(step.view, len(number)) for step in self.trace.steps[: max(size, 1)])
+        return Evidence(views, tuple(self._log.actions[: len(views) - 1]), self.bound.dstates or 0)
 
     def _count_apart(self) -> None:
         """Where the search was stopped: the steps of the whole trace that are pairwise apart are a bound, too."""

@@ -15,7 +15,6 @@ from test_speedups import PLAIN, machines
 
 from ssh_abduction import Speedups, Status, Theory, Trace, annealing, engine, facts, named, nearby, solve, solver
 from ssh_abduction.annealing import annealed
-from ssh_abduction.apart import apartness, clique, far_apart
 from ssh_abduction.asking import Watch
 from ssh_abduction.chart import Chart, NoFrame
 from ssh_abduction.checker import check
@@ -28,19 +27,18 @@ CAUSAL = Theory.causal()
 def nearby_search(trace: Trace) -> NearbySearch:
     """One that pins a clique, as named.py does."""
     log = Log(trace, CAUSAL)
-    apart = apartness(log.seen, log.actions)
-    pinned = clique(apart, log.seen)
-    may_be = [[pinned.index(t)] if t in pinned else (~row[pinned]).nonzero()[0].tolist() for t, row in enumerate(apart)]
-    far = far_apart(apart.copy(), log.seen, log.actions)
+    chart = Chart.of_steps(log, len(trace))
+    pinned = chart.continuations.clique()
+    may_be = [(~row[pinned]).nonzero()[0].tolist() for row in chart.apart()]
     watch = Watch(100.0)  # so that what does not end fails
     watch.start()
     return NearbySearch(
         watch,
         Speedups(),
-        chart=Chart.of_steps(log, len(trace)),
+        chart=chart,
         clique=pinned,
         may_be=may_be,
-        far=far,
+        far=lambda node: chart.continuations.apart_from(node, actions=2),
         configuration="tweety",
     )
 
@@ -149,8 +147,8 @@ def test_a_causal_maze_is_guessed_by_its_turns(seed: int) -> None:
 
 @pytest.mark.parametrize("beside", [True, False])
 def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
-    """The robot was in 64 states; what is merged at once has more."""
-    walk = maze(4, 4, steps=1200, seed=0)
+    """The robot was in 100 states; what is merged at once has more."""
+    walk = maze(5, 5, steps=1600, seed=0)
     best: list[int] = []
 
     def stop(self: NearbySearch, *_: object) -> Generator[list[int], None, str]:
@@ -174,7 +172,7 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
         solution = limited.solution(tuple(limited))
     assert solution.stopped == "interrupted"
     assert solution.cost
-    assert solution.cost.dstates == best[0] <= 64
+    assert solution.cost.dstates == best[0] <= 100
     assert check(walk.trace, solution.maps[0], CAUSAL) == ()
 
 

@@ -8,6 +8,8 @@ from itertools import islice, product
 from unittest.mock import patch
 
 import clingo
+import networkx as nx
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,7 +18,7 @@ from strategies import traces
 
 from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, annealing, engine, facts, named, solve, solver
 from ssh_abduction.annealing import annealed_steps
-from ssh_abduction.apart import apart_from, apartness, clique, far_apart
+from ssh_abduction.apart import Continuations, clique
 from ssh_abduction.asking import Stopped
 from ssh_abduction.chart import Chart
 from ssh_abduction.checker import check
@@ -56,7 +58,7 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trac
     cores = data.draw(st.sampled_from([0, 1, 10_000]), label="cores")
     spares = data.draw(st.sampled_from([0, 1, 2]), label="spare names")
     settings = patch.multiple(engine, FIRST_PREFIXES=first, AT_ONCE=at_once)
-    fewer = patch.multiple(named, AT_ONCE=at_once, PATIENCE=patience, HELD_BACK=held, CORES=cores, SPARES=spares)
+    fewer = patch.multiple(named, AT_ONCE=at_once, WHOLE=at_once, PATIENCE=patience, HELD_BACK=held, CORES=cores, SPARES=spares)
     with settings, fewer, patch.object(solver, "FEW_STEPS", 0):
         found = solve(trace, Theory.causal(), maps=0, speedups=Speedups.without(off))
     assert found.status is expected.status is Status.OPTIMAL
@@ -154,24 +156,33 @@ def test_merging_greedily_gives_a_map(trace: Trace) -> None:
 @settings(deadline=None, derandomize=True)
 @given(machines(most_steps=30))
 def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
-    """The matrix against its definition, step by step; and every step of the clique is apart from every other."""
+    """The matrix against its definition, step by step; and the cliques against all there are, as networkx finds them."""
     log = Log(trace, Theory.causal())
-    apart = apartness(log.seen, log.actions)
-    for i in range(len(trace)):
-        for j in range(len(trace)):
-            k = 0
-            while log.seen[i + k] == log.seen[j + k] and log.actions[i + k : i + k + 1] == log.actions[j + k : j + k + 1] != []:
-                k += 1
-            assert apart[i, j] == (log.seen[i + k] != log.seen[j + k])
-        assert apart_from(log.seen, log.actions, i).tolist() == apart[i].tolist()
-    far = far_apart(apart.copy(), log.seen, log.actions)
-    shown = [(log.seen[t], dict([(log.actions[t], log.seen[t + 1])] if t + 1 < len(trace) else [])) for t in range(len(trace))]
-    for (i, (view, follows)), (j, (other, leads)) in product(enumerate(shown), repeat=2):
-        near = view != other or any(follows[action] != leads[action] for action in follows.keys() & leads.keys())
-        assert far[i, j] == (apart[i, j] and not near)
-    steps = clique(apart, log.seen)
-    assert steps == sorted(set(steps))
-    assert all(apart[i, j] for i in steps for j in steps if i != j)
+    continuations = Continuations(log.seen, log.actions)
+    apart, graph = continuations.apart(), nx.empty_graph(len(trace))
+    for i, j in product(range(len(trace)), repeat=2):
+        k = 0
+        while log.seen[i + k] == log.seen[j + k] and log.actions[i + k : i + k + 1] == log.actions[j + k : j + k + 1] != []:
+            k += 1
+        differ = log.seen[i + k] != log.seen[j + k]
+        assert apart[i, j] == differ
+        assert [continuations.apart_from(i, actions)[j] for actions in range(4)] == [differ and k >= actions for actions in range(4)]
+        graph.add_edges_from([(i, j)] if differ else [])
+    cliques = list(nx.find_cliques(graph))
+    most = max((len(steps), sum(int(apart[i].sum()) for i in steps)) for steps in cliques)
+    steps = continuations.clique()
+    assert sorted(steps) in map(sorted, cliques)
+    assert (len(steps), sum(int(apart[i].sum()) for i in steps)) == most
+    assert sorted(clique(apart, log.seen)) in map(sorted, cliques)
+
+
+@pytest.mark.parametrize("period", [1, 2, 7])
+def test_continuations_of_circuits(period: int) -> None:
+    """They have almost all of the trace in common, so that it takes many doublings to tell them apart."""
+    seen = [step % period for step in range(1000)]
+    continuations = Continuations(seen, [0] * 999)
+    assert len(continuations.clique()) == period
+    assert continuations.apart().tolist() == (np.subtract.outer(seen, seen) != 0).tolist()
 
 
 def test_a_search_without_greedy_merging_has_a_bound_when_time_is_over() -> None:
@@ -195,10 +206,11 @@ def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
     """So they do where each step was a dstate, and these are merged while they can be."""
     theory = Theory.causal()
     log = Log(trace, theory)
-    apart, links = apartness(log.seen, log.actions), Chart.of_steps(log, len(trace)).links
+    chart = Chart.of_steps(log, len(trace))
+    apart, links = chart.apart(), chart.links
     fewest = solve(trace, theory).cost
     assert fewest
-    known = merged(apart, links, clique(apart, log.seen))
+    known = merged(apart, links, chart.continuations.clique())
     for labels in known, thinned(apart, links, range(len(trace))), thinned(apart, links, known):
         found = facts.causal_map(labels, trace)
         assert check(trace, found, theory) == ()
@@ -210,7 +222,8 @@ def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
 def test_dstates_that_are_one_are_merged() -> None:
     """A machine of two states, of which the odd and even visits are told apart."""
     log = Log(trace := Trace.from_steps("ababababa", ["go"] * 8), Theory.causal())
-    apart, links = apartness(log.seen, log.actions), Chart.of_steps(log, len(trace)).links
+    chart = Chart.of_steps(log, len(trace))
+    apart, links = chart.apart(), chart.links
     assert thinned(apart, links, [0, 1, 2, 3, 0, 1, 2, 3, 0]) == [0, 1, 0, 1, 0, 1, 0, 1, 0]
 
 
