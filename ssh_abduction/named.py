@@ -46,7 +46,7 @@ from ssh_abduction.chart import Chart, Link, NoFrame, numbered
 from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found
 from ssh_abduction.merging import merged, merged_near, thinned
 from ssh_abduction.nearby import AT_A_TIME, SECONDS_A_CHARACTER, Beside, NearbySearch, mended
-from ssh_abduction.replay import Log
+from ssh_abduction.replay import Log, Outcome
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
@@ -55,9 +55,10 @@ HELD_BACK = 100  # maps that are kept until all links are given; then they strea
 PREPARING = 0.6  # of the time that grounding took, clingo takes before it begins to solve, and can be stopped
 SPARES = 2  # spare names of a view, to begin with
 PATIENCE = 2000  # conflicts after which all links are given
+MORE_LINKS = 1000  # of a long trace, that clingo is given then; of others all
 CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
 GUESSES = 10  # that are waited for until one is a map, where the robot does not turn
-WHOLE = 100_000  # steps of which a clique is pinned at once
+WHOLE = 100_000  # steps that are taken at once
 TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside that
 
 
@@ -74,6 +75,12 @@ def _ever_fewer(found: Iterable[list[int]], known: list[int] | None = None) -> I
         if known is None or len(set(labels)) < len(set(known)):
             known = labels
             yield labels
+
+
+def _may_be(chart: Chart, clique: Sequence[int]) -> list[list[int]]:
+    """Of each step, those of the clique, by number, that it is not apart from."""
+    apart = np.stack([chart.continuations.apart_from(step) for step in clique], axis=1)
+    return [(~row).nonzero()[0].tolist() for row in apart]
 
 
 class NamedEngine(ChartedEngine):
@@ -107,11 +114,9 @@ class NamedEngine(ChartedEngine):
         began = time.perf_counter()
         self.size = size
         self._chart = Chart.of_steps(self._log, size)
-        continuations = self._chart.continuations
-        self.clique = continuations.clique() if self._speedups.clique else [0]
+        self.clique = self._chart.continuations.clique() if self._speedups.clique else [0]
         self._watch.check()
-        pinned = np.stack([continuations.apart_from(step) for step in self.clique], axis=1)
-        self._may_be = [(~row).nonzero()[0].tolist() for row in pinned]
+        self._may_be = _may_be(self._chart, self.clique)
         self._one_by_one = self._hard = False
         self._known = None
         self._spares = self._first_spares()
@@ -179,7 +184,7 @@ class NamedEngine(ChartedEngine):
                         yield from self._search_alone()
                     self._ask_one_by_one()
                     continue
-                self._add(self._chart.links)
+                self._add(self._more_links())
                 self._configure()
             elif not self._named_more(answer):
                 self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
@@ -205,13 +210,18 @@ class NamedEngine(ChartedEngine):
 
     def _search_nearby(self) -> Iterator[list[int]]:
         """Begin to search for small maps in another thread; where there is but one processor, give a map merged by evidence."""
-        if len(self._chart.seen) > AT_ONCE or not (self._speedups.greedy or self._speedups.annealed):
+        if not (self._speedups.greedy or self._speedups.annealed):
             return
         if self._has_processors():
             watch = Watch(beside=self._watch)
             search = self._nearby(watch)
-            found = chain(self._merged(watch.check), self._near_guess(search, watch.check))
+            if self._is_long:
+                found: Iterator[list[int]] = self._from_beginning(watch.check)
+            else:
+                found = chain(self._merged(watch.check), self._near_guess(search, watch.check))
             self._beside = Beside(search, watch, _ever_fewer(found))
+            return
+        if self._is_long:
             return
         for labels in self._merged(self._watch.check):
             self._heed(labels, 0)
@@ -219,7 +229,7 @@ class NamedEngine(ChartedEngine):
 
     def _search_alone(self) -> Iterator[list[int]]:
         """Search for small maps near a guess for a while, with nothing beside it. Raises Settled where one has fewest dstates."""
-        if len(self._chart.seen) > AT_ONCE:
+        if self._is_long:
             return
         search = self._nearby(self._watch)
         for labels in _ever_fewer(self._near_guess(search, self._watch.check, TRIES), self._known):
@@ -245,9 +255,26 @@ class NamedEngine(ChartedEngine):
         if self._speedups.greedy:
             yield merged(self._chart.apart(), self._chart.links, self.clique, check)
 
+    @property
+    def _is_long(self) -> bool:
+        """Whether there are too many nodes to compare them in pairs."""
+        return len(self._chart.seen) > AT_ONCE
+
+    def _from_beginning(self, check: Callable[[], None]) -> Iterator[list[int]]:
+        """Labels of a map of a long trace's beginning that is guessed, if it is one of all the trace, too."""
+        part = Chart.of_steps(self._log, AT_ONCE)
+        clique = part.continuations.clique()
+        guess = self._guessed(part, clique, _may_be(part, clique), check) if self._speedups.annealed else None
+        if guess is not None:
+            apart = part.apart()
+            labels = thinned(apart, part.links, merged_near(apart, part.links, guess, check), check)
+            replayed = self._log.replay(labels)
+            if replayed.outcome is Outcome.PREDICTED:
+                yield list(replayed.labels[: self.size])
+
     def _near_guess(self, search: NearbySearch, check: Callable[[], None], tries: int | None = None) -> Iterator[list[int]]:
         """Labels of a map that is guessed, and of those near that."""
-        guess = self._guessed(check) if self._speedups.annealed else None
+        guess = self._guessed(self._chart, self.clique, self._may_be, check) if self._speedups.annealed else None
         if guess is None:
             return
         apart, links = self._chart.apart(), self._chart.links
@@ -255,19 +282,19 @@ class NamedEngine(ChartedEngine):
         del apart  # as large as steps x steps
         yield from search.fewer(known, tries)
 
-    def _guessed(self, check: Callable[[], None]) -> list[int] | None:
-        """A guess at the dstates of all steps, -1 where it is not sure; None where that would take too much memory."""
+    def _guessed(self, steps: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None]) -> list[int] | None:
+        """A guess at the dstates of these first steps, -1 where it is not sure; None where that would take too much memory."""
         try:
-            chart = Chart.turned(self._trace, self._log, self.size)
+            chart = Chart.turned(self._trace, self._log, len(steps.seen))
         except NoFrame:
-            guesses: Iterable[list[int]] = islice(annealed_steps(self._chart, self.clique, self._may_be, check), GUESSES)
+            guesses: Iterable[list[int]] = islice(annealed_steps(steps, clique, may_be, check), GUESSES)
         else:
             labels = annealed(chart, check).labels(chart)
             guesses = [[labels[node] for node in chart.node_of]]
         guess = None
         for labels in guesses:
-            guess = mended(labels, self._chart)
-            if self._chart.is_map(guess):
+            guess = mended(labels, steps)
+            if steps.is_map(guess):
                 break
         return guess
 
@@ -456,6 +483,13 @@ class NamedEngine(ChartedEngine):
             self._watch.check()
             self._give(added[start : start + AT_A_TIME])
         self._check_ahead(PREPARING * (self.ground_seconds - before))
+
+    def _more_links(self) -> list[Link]:
+        """Links that clingo does not know yet: all of them, or of a long trace those whose ends have the fewest names to choose from."""
+        left = [link for link in self._chart.links if link not in self._links]
+        if not self._is_long:
+            return left
+        return sorted(left, key=lambda link: len(self._choices[link[0]]) * len(self._choices[link[2]]))[:MORE_LINKS]
 
     def _give(self, links: Iterable[Link]) -> None:
         began = time.perf_counter()

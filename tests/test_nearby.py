@@ -258,3 +258,40 @@ def test_what_turns_of_any_kind_show_is_put_together() -> None:
     chart = Chart.turned(trace, Log(trace, CAUSAL), 7)
     a, b, d, c = range(4)  # by first step
     assert chart.stars == ((a, b, c, d), (c, d, a, b))
+
+
+@pytest.mark.parametrize(("first", "goes_on"), [(1200, True), (40, False)])
+def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(first: int, goes_on: bool) -> None:
+    """Of 1,200 steps in a maze of 9 cells the map holds to the end; of 40 steps it does not."""
+    trace = maze(3, 3, steps=1600, seed=0).trace
+    watch = Watch(100.0)
+    watch.start()
+    long = named.NamedEngine(trace, CAUSAL, watch, Log(trace, CAUSAL), Speedups())
+    long.grow(len(trace))
+    with patch.object(named, "AT_ONCE", first):
+        found = list(long._from_beginning(watch.check))
+    assert len(found) == goes_on
+    fewest = solve(trace, CAUSAL).cost
+    assert fewest
+    for labels in found:
+        assert check(trace, facts.causal_map(labels, trace), CAUSAL) == ()
+        assert len(set(labels)) == fewest.dstates
+
+
+def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
+    """The simplest first, so that it comes to an end before it was given all; the map is that of a guess at the beginning, or clingo's."""
+    walk = maze(4, 4, steps=4000, seed=1, loops=0.3)
+    given: list[int] = []
+    add = named.NamedEngine._add
+
+    def counted(self: named.NamedEngine, links: list[tuple[int, int, int]]) -> None:
+        add(self, links)
+        given.append(len(self._links))
+
+    expected = solve(walk.trace, CAUSAL)
+    with patch.multiple(named, AT_ONCE=1000, PATIENCE=10, MORE_LINKS=100), patch.object(named.NamedEngine, "_add", counted):
+        found = solve(walk.trace, CAUSAL)
+    assert found.status is expected.status is Status.OPTIMAL
+    assert found.cost == expected.cost
+    assert check(walk.trace, found.maps[0], CAUSAL) == ()
+    assert 100 < max(given) < 4000

@@ -53,12 +53,13 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trac
     expected = solve(trace, Theory.causal(), maps=0, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, 5, 32]), label="first prefixes")
     at_once = data.draw(st.sampled_from([4, 8000]), label="at once")
+    whole = data.draw(st.sampled_from([4, 8000]), label="whole")
     patience = data.draw(st.sampled_from([0, 1, 2000]), label="patience")
     held = data.draw(st.sampled_from([1, 100]), label="held back")
     cores = data.draw(st.sampled_from([0, 1, 10_000]), label="cores")
     spares = data.draw(st.sampled_from([0, 1, 2]), label="spare names")
     settings = patch.multiple(engine, FIRST_PREFIXES=first, AT_ONCE=at_once)
-    fewer = patch.multiple(named, AT_ONCE=at_once, WHOLE=at_once, PATIENCE=patience, HELD_BACK=held, CORES=cores, SPARES=spares)
+    fewer = patch.multiple(named, AT_ONCE=at_once, WHOLE=whole, PATIENCE=patience, HELD_BACK=held, CORES=cores, SPARES=spares, MORE_LINKS=2)
     with settings, fewer, patch.object(solver, "FEW_STEPS", 0):
         found = solve(trace, Theory.causal(), maps=0, speedups=Speedups.without(off))
     assert found.status is expected.status is Status.OPTIMAL
