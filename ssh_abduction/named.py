@@ -150,7 +150,9 @@ class NamedEngine(ChartedEngine):
             yield [0]
             return
         try:
-            yield from self._searched()
+            for labels in self._searched():
+                self._known = labels
+                yield labels
         except Settled:
             self._end_beside()
             yield self._known or []

@@ -64,6 +64,8 @@ FIRST_PREFIX = 8  # steps; short enough that solving it costs next to nothing
 HELD_BACK = 1000  # maps kept until a prefix proves long enough; from there on they stream
 FIRST_PATHS = 8  # names for paths to begin with
 FEW_STEPS = 24  # of a trace or a prefix; so many are solved sooner without names, a map made greedily, or a question from below
+ONE_MORE = 1.0  # seconds for which one more map is sought, where as many as asked for are known,
+ONE_MORE_SHARE = 0.1  # or so much of the time they took, if that is more
 FRAME_AFTER = 1.0  # seconds after which a map with frames is sought, where the theory does not ask for one
 FRAMING = 30.0  # seconds that this may take, at most
 FRAMING_SHARE = 0.4  # of the time that is left, for either, if that is less
@@ -174,7 +176,8 @@ def solve(
 
     theory       which axioms and which preference; Theory.topological() by default
     limit        seconds of wall-clock time; when they are over, the best answer so far is returned
-    maps         list at most so many maps; 0 lists all (take `Search` to stream them)
+    maps         list at most so many maps; 0 lists all (take `Search` to stream them). Where there are so many, one more is sought for a second,
+                 or a tenth of the time so far: only if that ends the answer is complete
     memory       MiB of memory that the process may use at its peak before the search stops
     speedups     which speed-ups are on; none changes the answer
     on_progress  is told now and then how far the search is
@@ -307,9 +310,13 @@ class Search:
                     self._watch.stop()
                     yield ssh_map
                     self._watch.start()
+                    if self.count == self._most:
+                        self._watch.pause_after(self._watch.elapsed() + max(ONE_MORE, ONE_MORE_SHARE * self._watch.elapsed()))
                 self.complete = True
             elif self.status is Status.UNSATISFIABLE:
                 self.complete = True
+        except Paused:
+            self.stopped = "maps limit"
         except Stopped as stop:
             self.stopped = stop.reason
         except KeyboardInterrupt:
@@ -318,6 +325,7 @@ class Search:
             self._engine.intact = False
             raise
         finally:
+            self._watch.pause_after(math.inf)
             self._watch.stop()
             self._engine.settle()
         self._raise_bound(self._engine.bound)
@@ -548,7 +556,7 @@ class Search:
         while True:
             held: list[SSHMap] = []
             stuck = 0
-            streaming = False
+            streaming = self.prefix == len(self.trace)
             try:
                 for found in self._engine.maps_of_cost(self._cost, self._most and self._most + 1):
                     replayed = self._log.replay(found.map.labels)

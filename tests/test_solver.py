@@ -28,10 +28,12 @@ import ssh_abduction.solver as solver_module
 from benchmarks.instances import maze
 from ssh_abduction import Progress, Search, SolverError, Speedups, SSHMap, Status, Theory, TheoryError, Trace, TraceError, solve
 from ssh_abduction.checker import check
+from ssh_abduction.engine import Found
 from ssh_abduction.errors import SSHError
 from ssh_abduction.explain import Interrupted, explain
 from ssh_abduction.facts import links_of
 from ssh_abduction.framed import FramedEngine
+from ssh_abduction.named import NamedEngine
 from ssh_abduction.replay import Log, Outcome
 
 THEORIES = {"causal": Theory.causal(), "topological": Theory.topological(), "circumscriptive": Theory.circumscriptive()}
@@ -526,3 +528,23 @@ def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
         assert found[most].stopped == "interrupted"
         assert check(trace, found[most].maps[0], found[most].theory) == ()
     assert len(found[500].maps[0].dstates) < 0.5 * len(found[8].maps[0].dstates)
+
+
+def test_whether_there_is_one_more_map_is_not_sought_for_long() -> None:
+    """Where the last of those asked for is known, and what comes after it takes its time."""
+    trace = maze(2, 2, steps=200, seed=0).trace
+    every = solve(trace, Theory.causal(), maps=0)
+    assert (every.complete, every.stopped) == (True, None)
+    listed = NamedEngine.maps_of_cost
+
+    def slow(self: NamedEngine, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
+        yield from listed(self, cost, enough)
+        while True:
+            self._watch.check()
+
+    with patch.object(NamedEngine, "maps_of_cost", slow), patch.object(solver_module, "ONE_MORE", 0.01):
+        search = Search(trace, Theory.causal(), maps=every.count, limit=100.0)
+        asked_for = search.solution(tuple(search))
+    assert set(asked_for.maps) == set(every.maps)
+    assert (asked_for.status, asked_for.complete, asked_for.stopped) == (Status.OPTIMAL, False, "maps limit")
+    assert not search.over()

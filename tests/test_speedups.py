@@ -257,7 +257,7 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
 
 @pytest.mark.parametrize("off", ["", "lazy"])
 def test_maps_found_before_a_limit_strikes_are_given(off: str) -> None:
-    """Though they are held back until it is known that the links that clingo was given are enough."""
+    """Though they are held back until it is known that the links that clingo was given are enough; and the one that showed what is minimal, too."""
     found = named.NamedEngine._all_of_bound
 
     def stopped(self: named.NamedEngine, spares: int) -> Iterator[dict[int, int]]:
@@ -267,7 +267,8 @@ def test_maps_found_before_a_limit_strikes_are_given(off: str) -> None:
     walk = maze(3, 3, steps=200, seed=0)
     with patch.object(named.NamedEngine, "_all_of_bound", stopped):
         solution = solve(walk.trace, Theory.causal(), maps=100, speedups=Speedups.without(off))
-    assert (solution.status, solution.count, solution.stopped) == (Status.OPTIMAL, 3, "time limit")
+    assert (solution.status, solution.stopped) == (Status.OPTIMAL, "time limit")
+    assert solution.count == len(set(solution.maps)) >= 3
     for ssh_map in solution.maps:
         assert check(walk.trace, ssh_map, Theory.causal()) == ()
 
