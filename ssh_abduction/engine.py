@@ -185,12 +185,7 @@ class ChartedEngine(Engine):
         steps = len(self._trace)
         if self.size < FIRST_PREFIXES:
             return min(steps, max(failed + 1, FIRST_PREFIXES))
-        return steps if steps <= self.whole else min(steps, max(failed + 1, 2 * self.size, self.whole))
-
-    @property
-    def whole(self) -> int:
-        """A trace of so many steps is taken at once."""
-        return AT_ONCE
+        return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * self.size, AT_ONCE))
 
     @property
     def size_to_go_on(self) -> int:

@@ -1,6 +1,6 @@
 """An engine for the causal theory on long traces: the dstates have names before clingo is asked.
 
-Steps that are pairwise apart (`apart.py`) are pinned to names of their own. That bounds the number of dstates from below, leaves no
+As many steps as are pairwise apart (`apart.py`) are pinned to names of their own. That bounds the number of dstates from below, leaves no
 two ways to name these dstates, and lets every other step choose only among the names that it is not apart from. A view has a few
 spare names, at the cost of one dstate each, and a *rest*, which stands for all dstates of the view beyond them.
 
@@ -20,6 +20,9 @@ Raising the bound by cores stalls when what is missing can be spread over many v
 CORES conflicts the numbers of dstates are asked for one by one instead, from the bound up: is there an answer that costs no more? If
 there is none, the bound is one higher. The first answer without a rest is a minimal map, as it costs what the bound is; the same
 search then goes on with the other maps.
+
+Of a long trace, whose steps are too many to be compared in pairs, as many are taken as it takes for the clique to be as large as that of all; and what
+conflicts ask for is given a thousand links at a time.
 
 Beside all that small maps are sought in a thread of its own. First steps are merged by evidence (`merging.py`), so that a limit leaves a map that is
 not bad; then a map is guessed, of places with frames where the trace lets itself be taken for one of these (`annealing.py`), and smaller ones are
@@ -58,7 +61,7 @@ PATIENCE = 2000  # conflicts after which all links are given
 MORE_LINKS = 1000  # of a long trace, that clingo is given then; of others all
 CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
 GUESSES = 10  # that are waited for until one is a map, where the robot does not turn
-WHOLE = 100_000  # steps that are taken at once
+WHOLE = 100_000  # steps that are taken at once, at most, if more of them are apart then
 TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside that
 
 
@@ -96,9 +99,17 @@ class NamedEngine(ChartedEngine):
     def over(self, trace: Trace, watch: Watch, log: Log) -> NamedEngine:
         return NamedEngine(trace, self._theory, watch, log, self._speedups)
 
-    @property
-    def whole(self) -> int:
-        return WHOLE
+    def next_size(self, failed: int) -> int:
+        """Of a long trace, so many steps that more of them would not have a larger clique."""
+        size, most = super().next_size(failed), min(len(self._trace), WHOLE)
+        if AT_ONCE <= size < most and self._speedups.clique:
+            largest = self._clique_size(most)
+            while size < most and self._clique_size(size) < largest:
+                size = min(2 * size, most)
+        return size
+
+    def _clique_size(self, steps: int) -> int:
+        return len(Chart.of_steps(self._log, steps).continuations.clique())
 
     def grow(self, size: int) -> None:
         if size == self.size:

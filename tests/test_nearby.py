@@ -295,3 +295,18 @@ def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
     assert found.cost == expected.cost
     assert check(walk.trace, found.maps[0], CAUSAL) == ()
     assert 100 < max(given) < 4000
+
+
+def test_of_a_long_trace_as_much_is_taken_as_adds_to_the_clique() -> None:
+    trace = maze(3, 3, steps=3000, seed=0).trace
+    log = Log(trace, CAUSAL)
+    long = named.NamedEngine(trace, CAUSAL, Watch(100.0), log, Speedups())
+    long.size = 32
+    with patch.object(engine, "AT_ONCE", 50), patch.object(named, "AT_ONCE", 50):
+        size = long.next_size(32)
+        assert long.next_size(10) == size
+        long.size = size
+        assert long.next_size(size) == min(2 * size, 3001)
+    sizes = [len(Chart.of_steps(log, steps).continuations.clique()) for steps in (size // 2, size, 3001)]
+    assert sizes[0] < sizes[1] == sizes[2]
+    assert size < 3001
