@@ -69,7 +69,11 @@ class Continuations:
 
     def apart(self) -> Matrix:
         """Which pairs of steps are apart: steps x steps."""
-        return np.stack([self.apart_from(step) for step in range(len(self._place))])
+        steps = len(self._place)
+        apart = np.empty((steps, steps), dtype=bool)
+        for step in range(steps):
+            apart[step] = self.apart_from(step)
+        return apart
 
     def clique(self) -> list[int]:
         """A largest clique of steps, in order; among the largest, one whose steps are apart from most."""

@@ -43,7 +43,7 @@ import numpy as np
 
 from ssh_abduction import facts
 from ssh_abduction.annealing import annealed, annealed_steps
-from ssh_abduction.apart import Matrix
+from ssh_abduction.apart import Continuations, Matrix
 from ssh_abduction.asking import POLL, Stopped, Watch, new_control
 from ssh_abduction.chart import Chart, Link, NoFrame, numbered
 from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found
@@ -57,7 +57,7 @@ from ssh_abduction.trace import Trace
 HELD_BACK = 100  # maps that are kept until all links are given; then they stream
 PREPARING = 0.6  # of the time that grounding took, clingo takes before it begins to solve, and can be stopped
 SPARES = 2  # spare names of a view, to begin with
-PATIENCE = 2000  # conflicts after which all links are given
+PATIENCE = 2000  # conflicts after which more links are given
 MORE_LINKS = 1000  # of a long trace, that clingo is given then; of others all
 CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
 GUESSES = 10  # that are waited for until one is a map, where the robot does not turn
@@ -109,7 +109,7 @@ class NamedEngine(ChartedEngine):
         return size
 
     def _clique_size(self, steps: int) -> int:
-        return len(Chart.of_steps(self._log, steps).continuations.clique())
+        return len(Continuations(self._log.seen[:steps], self._log.actions[: steps - 1]).clique())
 
     def grow(self, size: int) -> None:
         if size == self.size:
@@ -228,26 +228,17 @@ class NamedEngine(ChartedEngine):
         if self._has_processors():
             watch = Watch(beside=self._watch)
             search = self._nearby(watch)
-            if self._is_long:
-                found: Iterator[list[int]] = self._from_beginning(watch.check)
-            else:
-                found = chain(self._merged(watch.check), self._near_guess(search, watch.check))
-            self._beside = Beside(search, watch, _ever_fewer(found))
-            return
-        if self._is_long:
-            return
-        for labels in self._merged(self._watch.check):
-            self._heed(labels, 0)
-            yield labels
+            near = chain(self._merged(watch.check), self._near_guess(search, watch.check))
+            self._beside = Beside(search, watch, _ever_fewer(self._from_beginning(watch.check) if self._is_long else near))
+        elif not self._is_long:
+            yield from self._merged(self._watch.check)
 
     def _search_alone(self) -> Iterator[list[int]]:
         """Search for small maps near a guess for a while, with nothing beside it. Raises Settled where one has fewest dstates."""
         if self._is_long:
             return
         search = self._nearby(self._watch)
-        for labels in _ever_fewer(self._near_guess(search, self._watch.check, TRIES), self._known):
-            self._heed(labels, 0)
-            yield labels
+        yield from _ever_fewer(self._near_guess(search, self._watch.check, TRIES), self._known)
         if search.bound:
             self._heed(self._known, search.bound)
             raise Settled
@@ -277,23 +268,25 @@ class NamedEngine(ChartedEngine):
         """Labels of a map of a long trace's beginning that is guessed, if it is one of all the trace, too."""
         part = Chart.of_steps(self._log, AT_ONCE)
         clique = part.continuations.clique()
-        guess = self._guessed(part, clique, _may_be(part, clique), check) if self._speedups.annealed else None
-        if guess is not None:
-            apart = part.apart()
-            labels = thinned(apart, part.links, merged_near(apart, part.links, guess, check), check)
-            replayed = self._log.replay(labels)
-            if replayed.outcome is Outcome.PREDICTED:
-                yield list(replayed.labels[: self.size])
+        labels = self._thin_guess(part, clique, _may_be(part, clique), check)
+        if labels is not None and (replayed := self._log.replay(labels)).outcome is Outcome.PREDICTED:
+            yield list(replayed.labels[: self.size])
 
     def _near_guess(self, search: NearbySearch, check: Callable[[], None], tries: int | None = None) -> Iterator[list[int]]:
         """Labels of a map that is guessed, and of those near that."""
-        guess = self._guessed(self._chart, self.clique, self._may_be, check) if self._speedups.annealed else None
+        labels = self._thin_guess(self._chart, self.clique, self._may_be, check)
+        if labels is not None:
+            yield from search.fewer(labels, tries)
+
+    def _thin_guess(
+        self, steps: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None]
+    ) -> list[int] | None:
+        """Labels of a map of these first steps that is guessed, and thinned; None where none is."""
+        guess = self._guessed(steps, clique, may_be, check) if self._speedups.annealed else None
         if guess is None:
-            return
-        apart, links = self._chart.apart(), self._chart.links
-        known = thinned(apart, links, merged_near(apart, links, guess, check), check)
-        del apart  # as large as steps x steps
-        yield from search.fewer(known, tries)
+            return None
+        apart = steps.apart()
+        return thinned(apart, steps.links, merged_near(apart, steps.links, guess, check), check)
 
     def _guessed(self, steps: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None]) -> list[int] | None:
         """A guess at the dstates of these first steps, -1 where it is not sure; None where that would take too much memory."""
