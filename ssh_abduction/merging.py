@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.apart import Matrix
-from ssh_abduction.chart import Link, numbered
+from ssh_abduction.chart import Chart, Link, numbered
 
 # Least evidence for a merge, and how much it has to be ahead of the next; among how many known dstates at most:
 DEMANDS = ((10, 1), (5, 1), (5, 2), (3, 1), (3, 3), (2, 2), (2, 10), (1, 3), (1, 100), (0, 1), (0, 2), (0, 1000))
@@ -98,14 +98,35 @@ def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int
     return _from_guess(apart, links, guess).labels()
 
 
-def thinned(apart: Matrix, links: Iterable[Link], labels: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
+def thinned(chart: Chart, labels: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
     """The dstate of each node in a map where no two dstates of this one are left that could be one.
 
-    Those seen at the fewest nodes are merged first, each with that for which the evidence is most. Parameters as above; the labels are those of a map.
+    Those seen at the fewest nodes are merged first, each with that for which the evidence is most.
+
+    labels  of the nodes of a chart, in a map
     """
-    classes = _from_guess(apart, links, labels, check)
+    dstates = numbered(labels)
+    first = np.unique(dstates, return_index=True)[1]
+    links = list(dict.fromkeys((dstates[t], action, dstates[u]) for t, action, u in chart.links))
+    classes = _Classes(_apart_in_map(np.asarray(chart.seen)[first], links), links, check, np.bincount(dstates))
+    classes.known[:] = True
     classes.thin_all()
-    return classes.labels()
+    return numbered(classes.root[dstates].tolist())
+
+
+def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link]) -> Matrix:
+    """Which dstates of a map are apart: those at which something else is seen, or from which an action leads to such, as far as the map says."""
+    leads: dict[int, NDArray[np.int_]] = {}
+    for dstate, action, leads_to in links:
+        leads.setdefault(action, np.full(len(seen), -1))[dstate] = leads_to
+    apart: Matrix = seen[:, None] != seen
+    while True:
+        before = apart.copy()
+        for there in leads.values():
+            known = np.flatnonzero(there >= 0)
+            apart[np.ix_(known, known)] |= apart[np.ix_(there[known], there[known])]
+        if (apart == before).all():
+            return apart
 
 
 def _from_guess(apart: Matrix, links: Iterable[Link], guess: Sequence[int], check: Callable[[], None] = lambda: None) -> _Classes:
@@ -122,8 +143,14 @@ class _Classes:
     known  of each root, whether its class is a dstate of the map
     """
 
-    def __init__(self, apart: Matrix, links: Iterable[Link], check: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, apart: Matrix, links: Iterable[Link], check: Callable[[], None] = lambda: None, nodes: NDArray[np.int_] | None = None
+    ) -> None:
+        """
+        nodes  how many nodes each step stands for, if not one
+        """
         steps = len(apart)
+        self._nodes = nodes
         self.root = np.arange(steps)
         self.known = np.zeros(steps, dtype=bool)
         self._apart = apart.copy()  # of each root, the steps that are apart from some step of its class
@@ -207,8 +234,8 @@ class _Classes:
 
     def thin(self, evidence: int) -> None:
         """Merge known dstates, those seen least first, as far as that evidence goes."""
-        nodes = np.bincount(self.root)
-        for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: int(nodes[root])):
+        nodes = np.bincount(self.root, self._nodes)
+        for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: nodes[root]):
             self._check()
             if self.known[root]:  # still
                 ranked = self._ranked(root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True)

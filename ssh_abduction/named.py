@@ -47,9 +47,10 @@ from ssh_abduction.apart import Continuations, Matrix
 from ssh_abduction.asking import POLL, Stopped, Watch, new_control
 from ssh_abduction.chart import Chart, Link, NoFrame, numbered
 from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found
+from ssh_abduction.following import followed
 from ssh_abduction.merging import merged, merged_near, thinned
 from ssh_abduction.nearby import AT_A_TIME, SECONDS_A_CHARACTER, Beside, NearbySearch, mended
-from ssh_abduction.replay import Log, Outcome
+from ssh_abduction.replay import Log
 from ssh_abduction.speedups import Speedups
 from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Trace
@@ -61,6 +62,7 @@ PATIENCE = 2000  # conflicts after which more links are given
 MORE_LINKS = 1000  # of a long trace, that clingo is given then; of others all
 CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
 GUESSES = 10  # that are waited for until one is a map, where the robot does not turn
+GUESSED = 24_000  # steps that are guessed in one go, at most
 WHOLE = 100_000  # steps that are taken at once, at most, if more of them are apart then
 TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside that
 
@@ -236,6 +238,7 @@ class NamedEngine(ChartedEngine):
     def _search_alone(self) -> Iterator[list[int]]:
         """Search for small maps near a guess for a while, with nothing beside it. Raises Settled where one has fewest dstates."""
         if self._is_long:
+            yield from _ever_fewer(self._from_beginning(self._watch.check), self._known)
             return
         search = self._nearby(self._watch)
         yield from _ever_fewer(self._near_guess(search, self._watch.check, TRIES), self._known)
@@ -265,28 +268,34 @@ class NamedEngine(ChartedEngine):
         return len(self._chart.seen) > AT_ONCE
 
     def _from_beginning(self, check: Callable[[], None]) -> Iterator[list[int]]:
-        """Labels of a map of a long trace's beginning that is guessed, if it is one of all the trace, too."""
-        part = Chart.of_steps(self._log, AT_ONCE)
-        clique = part.continuations.clique()
-        labels = self._thin_guess(part, clique, _may_be(part, clique), check)
-        if labels is not None and (replayed := self._log.replay(labels)).outcome is Outcome.PREDICTED:
-            yield list(replayed.labels[: self.size])
+        """Labels of maps of a long trace that guesses at its beginning lead to, ever longer ones, until one needs no dstates beyond those that the guess has."""
+        steps, most = AT_ONCE, len(self._chart.seen) if len(self._chart.seen) <= GUESSED else 2 * AT_ONCE
+        while self._speedups.annealed:
+            beginning = Chart.of_steps(self._log, steps)
+            clique = beginning.continuations.clique()
+            near = self._map_of_guess(beginning, clique, _may_be(beginning, clique), check)
+            for known in () if near is None else (thinned(beginning, near, check), near):
+                if labels := followed(self._log, known, check):
+                    yield labels[: self.size]
+                    yield (labels := thinned(self._chart, labels[: self.size], check))
+                    if len(set(labels)) <= len(set(known)):
+                        return
+            if steps == most:
+                return
+            steps = min(2 * steps, most)
 
     def _near_guess(self, search: NearbySearch, check: Callable[[], None], tries: int | None = None) -> Iterator[list[int]]:
         """Labels of a map that is guessed, and of those near that."""
-        labels = self._thin_guess(self._chart, self.clique, self._may_be, check)
-        if labels is not None:
-            yield from search.fewer(labels, tries)
+        near = self._map_of_guess(self._chart, self.clique, self._may_be, check) if self._speedups.annealed else None
+        if near is not None:
+            yield from search.fewer(thinned(self._chart, near, check), tries)
 
-    def _thin_guess(
+    def _map_of_guess(
         self, steps: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None]
     ) -> list[int] | None:
-        """Labels of a map of these first steps that is guessed, and thinned; None where none is."""
-        guess = self._guessed(steps, clique, may_be, check) if self._speedups.annealed else None
-        if guess is None:
-            return None
-        apart = steps.apart()
-        return thinned(apart, steps.links, merged_near(apart, steps.links, guess, check), check)
+        """Labels of a map of these first steps near a guess; None where none is made."""
+        guess = self._guessed(steps, clique, may_be, check)
+        return None if guess is None else merged_near(steps.apart(), steps.links, guess, check)
 
     def _guessed(self, steps: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None]) -> list[int] | None:
         """A guess at the dstates of these first steps, -1 where it is not sure; None where that would take too much memory."""

@@ -15,6 +15,10 @@ from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Step, Trace
 
 TRIED = 100  # dstates of a view that a step may be merged with
+STEPS_TRIED = (
+    3_000_000  # steps predicted in all, about a second, after which no step is merged with any: more of that would not make the map small;
+)
+EACH = 20  # or so many for each step, if that is more
 
 
 class Outcome(Enum):
@@ -84,18 +88,19 @@ class Log:
         """Labels of a map of the whole trace, made greedily: not minimal, but at once.
 
         Wherever the map does not know an action, the dstate among those that show what is seen is taken that then predicts most, if it
-        is not contradicted before the map knows no more; else a new one. So a link, once made, is never wrong.
+        is not contradicted before the map knows no more; else a new one, as all are once much was tried. So a link, once made, is never wrong.
         """
         actions, seen = self.actions, self.seen
         shows = [seen[0]]
         like = {seen[0]: [0]}  # the first dstates that show a view: as many as are tried
         links: dict[tuple[int, int], int] = {}
         labels = [0]
+        left = max(STEPS_TRIED, EACH * len(seen))  # steps to be predicted
         while len(labels) < len(seen):
             t = len(labels)
             key = (labels[-1], actions[t - 1])
             best, most = [len(shows)], 0
-            for label in like.setdefault(seen[t], []):
+            for label in like.setdefault(seen[t], []) if left > 0 else ():
                 links[key] = label
                 found = [label]
                 while (end := t + len(found)) < len(seen) and (following := links.get((found[-1], actions[end - 1]))) is not None:
@@ -105,8 +110,9 @@ class Log:
                 else:
                     if len(found) > most:
                         best, most = found, len(found)
+                left -= len(found)
             if not most:
-                if len(like[seen[t]]) < TRIED:
+                if len(like.setdefault(seen[t], [])) < TRIED:
                     like[seen[t]].append(len(shows))
                 shows.append(seen[t])
             links[key] = best[0]

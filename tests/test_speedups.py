@@ -212,20 +212,19 @@ def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
     fewest = solve(trace, theory).cost
     assert fewest
     known = merged(apart, links, chart.continuations.clique())
-    for labels in known, thinned(apart, links, range(len(trace))), thinned(apart, links, known):
+    for labels in known, thinned(chart, range(len(trace))), thinned(chart, known):
         found = facts.causal_map(labels, trace)
         assert check(trace, found, theory) == ()
         assert fewest.dstates <= len(found.dstates) <= len(trace)
         if labels is not known:
-            assert thinned(apart, links, labels) == labels
+            assert thinned(chart, labels) == labels
 
 
 def test_dstates_that_are_one_are_merged() -> None:
     """A machine of two states, of which the odd and even visits are told apart."""
     log = Log(trace := Trace.from_steps("ababababa", ["go"] * 8), Theory.causal())
     chart = Chart.of_steps(log, len(trace))
-    apart, links = chart.apart(), chart.links
-    assert thinned(apart, links, [0, 1, 2, 3, 0, 1, 2, 3, 0]) == [0, 1, 0, 1, 0, 1, 0, 1, 0]
+    assert thinned(chart, [0, 1, 2, 3, 0, 1, 2, 3, 0]) == [0, 1, 0, 1, 0, 1, 0, 1, 0]
 
 
 def test_a_limit_leaves_a_map_of_merged_steps() -> None:

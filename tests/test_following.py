@@ -1,0 +1,63 @@
+"""Long traces followed by a map of their beginning (following.py)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from unittest.mock import patch
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks.instances import maze
+from ssh_abduction import Theory, Trace, facts, following, solve
+from ssh_abduction.chart import Chart, numbered
+from ssh_abduction.checker import check
+from ssh_abduction.following import followed
+from ssh_abduction.merging import thinned
+from ssh_abduction.replay import Log
+from tests.strategies import traces
+
+CAUSAL = Theory.causal()
+
+
+@given(traces(max_steps=30), st.data())
+def test_what_a_map_is_followed_to_is_a_map(trace: Trace, data: st.DataObject) -> None:
+    """Also where the map of the beginning is wrong, or robots are told to be where few steps say so."""
+    beginning = trace.prefix(data.draw(st.integers(1, len(trace))))
+    settings = {name: data.draw(st.integers(1, 4)) for name in ("SETTLED", "FOUND", "AHEAD", "LOOKED")}
+    with patch.multiple(following, WALKS=data.draw(st.integers(0, 30)), MANY=data.draw(st.integers(1, 10)), **settings):
+        labels = followed(Log(trace, CAUSAL), solve(beginning, CAUSAL).maps[0].labels)
+    if labels is not None:
+        assert check(trace, facts.causal_map(labels, trace), CAUSAL) == ()
+
+
+@pytest.mark.parametrize(("steps", "kept"), [(500, False), (800, True), (1200, True)])
+def test_a_map_that_lacks_links_is_followed_to_the_map_of_all(steps: int, kept: bool) -> None:
+    """The map of the robot's first steps is that of what it did; where it says too little, a link is taken for clear that is wrong, and what was known around it is forgotten."""
+    walk = maze(4, 4, steps=6000, seed=1)
+    known, log = numbered(walk.truth[:steps]), Log(walk.trace, CAUSAL)
+    assert len(log.replay(known).labels) < len(walk.trace)
+    labels = followed(log, known)
+    assert labels is not None
+    assert (labels[:steps] == known) == kept
+    assert check(walk.trace, facts.causal_map(labels, walk.trace), CAUSAL) == ()
+    thin = thinned(Chart.of_steps(log, len(walk.trace)), labels)
+    assert check(walk.trace, facts.causal_map(thin, walk.trace), CAUSAL) == ()
+    assert len(set(thin)) <= len(set(walk.truth))
+
+
+def test_a_map_of_a_beginning_that_says_little_is_given_up() -> None:
+    walk = maze(4, 4, steps=6000, seed=1)
+    assert followed(Log(walk.trace, CAUSAL), numbered(walk.truth[:10])) is None
+
+
+def test_the_last_steps_of_a_map_are_where_actions_lead() -> None:
+    """Nothing that the map knows is asked again."""
+    walk = maze(3, 3, steps=2000, seed=0)
+    log = Log(walk.trace, CAUSAL)
+    with patch.object(following._Map, "_predicting", side_effect=AssertionError):
+        labels = followed(log, numbered(walk.truth[:1500]))
+    leads = {(here, action): there for (here, there), action in zip(pairwise(labels or ()), log.actions, strict=True)}
+    assert labels == numbered(walk.truth)
+    assert len(leads) == len({(here, action) for here, action in zip(walk.truth[:-1], log.actions, strict=True)})
