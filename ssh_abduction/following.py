@@ -39,10 +39,9 @@ def followed(log: Log, labels: Sequence[int], check: Callable[[], None] = lambda
     labels  of a map of the first steps, numbered from 0
     check   called now and then; may raise
     """
-    known = _Map(log, labels)
+    known = _Map(log, labels, check)
     patient, furthest, back = True, 0, 1
     for walk in range(WALKS):
-        check()
         links = len(known.leads)
         found = known.walked(lost=patient)
         if known.is_too_large:
@@ -63,7 +62,8 @@ class _Map:
     leads  where actions lead, by dstate and action
     """
 
-    def __init__(self, log: Log, labels: Sequence[int]) -> None:
+    def __init__(self, log: Log, labels: Sequence[int], check: Callable[[], None]) -> None:
+        self._check = check
         self._seen, self._actions = log.seen, log.actions
         self._shows = dict(zip(labels, log.seen, strict=False))  # what is seen at each dstate
         self.leads = {(labels[t], log.actions[t]): labels[t + 1] for t in range(len(labels) - 1)}
@@ -117,6 +117,7 @@ class _Map:
 
         link  is taken to lead to each dstate that is tried
         """
+        self._check()
         best, most, next_most = None, 0, 0
         for dstate in self._like.get(self._seen[step], ()):
             if link:

@@ -108,19 +108,20 @@ def thinned(chart: Chart, labels: Sequence[int], check: Callable[[], None] = lam
     dstates = numbered(labels)
     first = np.unique(dstates, return_index=True)[1]
     links = list(dict.fromkeys((dstates[t], action, dstates[u]) for t, action, u in chart.links))
-    classes = _Classes(_apart_in_map(np.asarray(chart.seen)[first], links), links, check, np.bincount(dstates))
+    classes = _Classes(_apart_in_map(np.asarray(chart.seen)[first], links, check), links, check, np.bincount(dstates))
     classes.known[:] = True
     classes.thin_all()
     return numbered(classes.root[dstates].tolist())
 
 
-def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link]) -> Matrix:
+def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link], check: Callable[[], None]) -> Matrix:
     """Which dstates of a map are apart: those at which something else is seen, or from which an action leads to such, as far as the map says."""
     leads: dict[int, NDArray[np.int_]] = {}
     for dstate, action, leads_to in links:
         leads.setdefault(action, np.full(len(seen), -1))[dstate] = leads_to
     apart: Matrix = seen[:, None] != seen
     while True:
+        check()
         before = apart.copy()
         for there in leads.values():
             known = np.flatnonzero(there >= 0)
@@ -167,6 +168,7 @@ class _Classes:
         first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
         self.known[list(first.values())] = True
         for node, label in enumerate(guess):
+            self._check()
             if label >= 0:
                 self.merge(first[label], node)
 

@@ -26,9 +26,9 @@ conflicts ask for is given a thousand links at a time.
 
 Beside all that small maps are sought in a thread of its own. First steps are merged by evidence (`merging.py`), so that a limit leaves a map that is
 not bad; then a map is guessed, of places with frames where the trace lets itself be taken for one of these (`annealing.py`), and smaller ones are
-sought near it (`nearby.py`). Whatever bound meets them ends the search. Where there is but one processor, steps are merged at once, and the guess
-waits until raising the bound by cores has stalled. Where there is no such search, clasp has the second processor: two threads, which tell each
-other what they learn.
+sought near it (`nearby.py`). Of a long trace the beginning is guessed, and what comes of that followed along the rest (`following.py`). Whatever bound
+meets these maps ends the search. Where there is but one processor, steps are merged at once, and the guess waits until raising the bound by cores has
+stalled. Where there is no such search, clasp has the second processor: two threads, which tell each other what they learn.
 """
 
 from __future__ import annotations
