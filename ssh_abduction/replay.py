@@ -15,9 +15,7 @@ from ssh_abduction.theory import Theory
 from ssh_abduction.trace import Step, Trace
 
 TRIED = 100  # dstates of a view that a step may be merged with
-STEPS_TRIED = (
-    3_000_000  # steps predicted in all, about a second, after which no step is merged with any: more of that would not make the map small;
-)
+STEPS_TRIED = 3_000_000  # steps predicted in all, about a second, after which no step is merged with any, as the map is large anyway;
 EACH = 20  # or so many for each step, if that is more
 
 
@@ -100,7 +98,8 @@ class Log:
             t = len(labels)
             key = (labels[-1], actions[t - 1])
             best, most = [len(shows)], 0
-            for label in like.setdefault(seen[t], []) if left > 0 else ():
+            alike = like.setdefault(seen[t], [])
+            for label in alike if left > 0 else ():
                 links[key] = label
                 found = [label]
                 while (end := t + len(found)) < len(seen) and (following := links.get((found[-1], actions[end - 1]))) is not None:
@@ -112,8 +111,8 @@ class Log:
                         best, most = found, len(found)
                 left -= len(found)
             if not most:
-                if len(like.setdefault(seen[t], [])) < TRIED:
-                    like[seen[t]].append(len(shows))
+                if len(alike) < TRIED:
+                    alike.append(len(shows))
                 shows.append(seen[t])
             links[key] = best[0]
             labels += best
