@@ -125,6 +125,14 @@ def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
     return sorted(found)
 
 
+def large_clique(apart: Matrix) -> list[int]:
+    """A large clique of a few nodes: the largest of those that are found greedily from each node on."""
+    random = np.random.default_rng(0)
+    found = [_filled(apart, [node], random) for node in range(len(apart))]
+    largest: list[int] = max(found, key=len, default=[])
+    return sorted(largest)
+
+
 def _clique(apart: Matrix) -> list[int]:
     """Greedily the step that is apart from most of those left, then swaps: take some out, fill up again, keep what is no smaller."""
     random = np.random.default_rng(0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from itertools import combinations, pairwise
+from itertools import pairwise, permutations
 from typing import TypeAlias
 
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
@@ -416,6 +416,18 @@ def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nod
     return "\n".join([*facts, *_preferred(theory)])
 
 
+def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
+    """The stretches of streets.lp, and pairs of them that cannot be one path, in neither direction."""
+    stretches = [_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("stretch", 1)]
+    rivals = {tuple(_atom(atom.symbol)[1]) for atom in control.symbolic_atoms.by_signature("rival", 3)}
+    return stretches, [(g, h) for g, h, direction in rivals if g != h and direction == 1 and (g, h, -1) in rivals]
+
+
+def pinned_facts(stretches: Iterable[int]) -> str:
+    """Stretches no two of which can be one path, as facts for streets.lp."""
+    return " ".join(f"pinned({stretch})." for stretch in stretches)
+
+
 def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int, int]]]:
     """Whether the labels of nodes are violated, and else which pairs of dstates are at different places, and which are one."""
     found: dict[str, list[tuple[int, int]]] = {"elsewhere": [], "one": []}
@@ -462,12 +474,12 @@ class StreetAnswer:
 
     at     of each place that the turns tell, the place that it is at, and how it is turned to it
     part   of each stretch, the path that it is part of, and in which direction
-    order  which places are before others
+    order  of each path, its places
     """
 
     at: dict[int, tuple[int, int]]
     part: dict[int, tuple[int, int]]
-    order: list[_Ahead]
+    order: dict[int, list[int]]
 
 
 class StreetReader:
@@ -476,7 +488,7 @@ class StreetReader:
     An answer is asked for atoms that it may hold, those of the last one first: that takes a third of the time that it takes to read all it holds.
     """
 
-    def __init__(self, control: Control, trace: Trace, chart: Chart, labels: Sequence[int]) -> None:
+    def __init__(self, control: Control, trace: Trace, theory: Theory, chart: Chart, labels: Sequence[int]) -> None:
         stands, runs = ({a: (b, c) for a, b, c in _literals(control, name)} for name in ("stands", "runs"))
         first: dict[int, int] = {}  # step at a dstate, by its label
         for t, node in enumerate(chart.node_of):
@@ -488,8 +500,9 @@ class StreetReader:
         # Stretches, each with a place that it passes:
         self._passes = {(run[0], component): None for _, component, _, run in self._dstates if run is not None}
         self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
+        self._total = theory.path_order == "total"
         self._before: dict[_Ahead, int] = {}  # literals, 0 for what is never so
-        self._turned: set[_Ahead] = set()  # what was the other way round when it was last asked for
+        self._order: dict[tuple[int, tuple[int, ...]], list[int]] = {}  # of a path and its places, when they were last asked for
         self._made: dict[tuple[object, ...], DState] = {}  # most dstates are the same in most maps
 
     def read(self, model: Model) -> StreetAnswer:
@@ -498,17 +511,21 @@ class StreetReader:
         on: dict[int, dict[int, None]] = {}  # of each path, the places on it
         for stretch, component in self._passes:
             on.setdefault(part[stretch][0], {})[at[component][0]] = None
-        order = []
-        for path, places in on.items():
-            for p, q in combinations(places, 2):
-                ways = (path, p, q), (path, q, p)
-                turned = ways[0] in self._turned
-                if self._is_before(model, ways[turned]):
-                    order.append(ways[turned])
-                elif self._is_before(model, ways[not turned]):
-                    order.append(ways[not turned])
-                    self._turned ^= {ways[0]}
-        return StreetAnswer(at, part, order)
+        return StreetAnswer(at, part, {path: self._ordered(model, path, tuple(places)) for path, places in on.items()})
+
+    def _ordered(self, model: Model, path: int, places: tuple[int, ...]) -> list[int]:
+        """The places of a path in order: mostly near that of the last answer in which it had these."""
+        order = list(self._order.get((path, places), places))
+        if self._total:
+            for i, place in enumerate(order):  # by insertion
+                to = i
+                while to and not self._is_before(model, (path, order[to - 1], place)):
+                    to -= 1
+                order.insert(to, order.pop(i))
+        else:
+            order = _in_order(places, (pair for pair in permutations(places, 2) if self._is_before(model, (path, *pair))))
+        self._order[path, places] = order
+        return order
 
     def _is_before(self, model: Model, ahead: _Ahead) -> bool:
         literal = self._before.get(ahead)
@@ -536,9 +553,9 @@ class StreetReader:
             if dstate is None:
                 dstate = self._made[key] = DState(*key)
             dstates.append(dstate)
-        before = ((*faced[h], arrived[p][0], arrived[q][0]) for h, p, q in answer.order)
-        ordered = [(path, p, q) if first == 1 else (path, q, p) for path, first, p, q in before]
-        return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(arrived))), _paths(len(faced), dstates, ordered))
+        orders = ((path, [arrived[p][0] for p in answer.order[h][::first]]) for h, (path, first) in faced.items())
+        paths = tuple(Path(path, tuple(order)) for path, order in orders)
+        return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(arrived))), paths)
 
 
 class _Choices:
@@ -581,12 +598,21 @@ def _view(trace: Trace, step: int) -> str | int:
 
 
 def _paths(count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]) -> tuple[Path, ...]:
-    """Paths with their places, each behind the ones that are before it: in a strict order it has more of those than they have."""
-    behind: list[dict[int, int]] = [{} for _ in range(count)]  # of each place on a path, how many are before it
+    """Paths with their places in order."""
+    on: list[set[int]] = [set() for _ in range(count)]
     for s in dstates:
         if s.path is not None and s.place is not None:
-            behind[s.path][s.place] = 0
+            on[s.path].add(s.place)
+    pairs: list[list[tuple[int, int]]] = [[] for _ in range(count)]
     for path, p, q in before:
-        if p in behind[path] and q in behind[path]:
-            behind[path][q] += 1
-    return tuple(Path(path, tuple(sorted(found, key=lambda p: (found[p], p)))) for path, found in enumerate(behind))
+        if p in on[path] and q in on[path]:
+            pairs[path].append((p, q))
+    return tuple(Path(path, tuple(_in_order(found, pairs[path]))) for path, found in enumerate(on))
+
+
+def _in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:
+    """Places, each behind the ones that are before it: in a strict order it has more of those than they have."""
+    behind = dict.fromkeys(places, 0)
+    for _, q in before:
+        behind[q] += 1
+    return sorted(behind, key=lambda p: (behind[p], p))

@@ -99,7 +99,7 @@ class FramedEngine(SameEngine):
 
     @property
     def _streets(self) -> Streets:
-        return Streets(self._trace, self._theory)
+        return Streets(self._trace, self._theory, pinned=self._speedups.clique)
 
     def grow(self, size: int) -> None:
         if size != self.size:
@@ -337,7 +337,7 @@ class FramedEngine(SameEngine):
     def _maps(self, naming: _Naming, mode: str, conflicts: int = -1) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
         control = naming.control or self._street_control(naming.labels)
-        reader = facts.StreetReader(control, self._trace, self._chart, naming.labels)
+        reader = facts.StreetReader(control, self._trace, self._theory, self._chart, naming.labels)
         answers = self._answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
         return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), self._theory), answers))
 

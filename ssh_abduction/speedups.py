@@ -16,7 +16,8 @@ class Speedups:
     path_names   begin with few names for paths
     from_below   ask a longer prefix first for a map that costs what was proved for a shorter one
     names        causal theory: give the dstates names beforehand; full theory where places have frames: settle them before places and paths
-    clique       with names: pin steps that are pairwise apart; with frames: let such nodes be the first at their dstates
+    clique       with names: pin steps that are pairwise apart; with frames: let such nodes be the first at their dstates, and pin
+                 stretches no two of which can be one path
     apart        with names: say which steps are apart, where more than one action shows it
     lazy         with names: give clingo only the links that replaying contradicts; with frames: of a long trace only the visits without which others are lost
     core_guided  with names or frames: raise the bound from below, rather than better the map

@@ -20,7 +20,7 @@ import numpy as np
 
 from ssh_abduction import encodings, facts
 from ssh_abduction.annealing import MORE, SECONDS, attempts
-from ssh_abduction.apart import Matrix
+from ssh_abduction.apart import Matrix, large_clique
 from ssh_abduction.asking import Control, Watch
 from ssh_abduction.chart import FramedChart
 from ssh_abduction.localising import faced, states_of, tracked
@@ -36,11 +36,15 @@ LOOSENED = 2  # so many travels, less one, from where a guess cannot be right it
 
 
 class Streets:
-    """The axioms of places and paths, for charts of one trace."""
+    """The axioms of places and paths, for charts of one trace.
 
-    def __init__(self, trace: Trace, theory: Theory) -> None:
+    pinned  whether stretches no two of which can be one path are named as paths beforehand
+    """
+
+    def __init__(self, trace: Trace, theory: Theory, *, pinned: bool = True) -> None:
         self._trace = trace
         self._theory = theory
+        self._pinned = pinned
 
     def control(self, chart: FramedChart, options: Sequence[str] = ()) -> clingo.Control:
         """A control with these axioms, and what happened; nothing is grounded yet."""
@@ -58,6 +62,9 @@ class Streets:
         nodes = range(len(labels)) if nodes is None else nodes
         control.add("base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single))
         control.ground([("base", []), *([("again", [])] if single else []), ("least", [])])
+        if self._pinned and not single:
+            control.add("pinned", [], facts.pinned_facts(_rivals(*facts.read_rivals(control))))
+        control.ground([("pinned", []), ("paths", [])])
         return control
 
     def telling(self, chart: FramedChart, labels: Sequence[int], loose: Iterable[int]) -> clingo.Control:
@@ -175,6 +182,16 @@ class Streets:
             right = first_failing(agrees, right + 1, len(places))
             left_out.add(places[right - 1])
         return of_first(len(places))
+
+
+def _rivals(stretches: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
+    """As many stretches as are soon found no two of which can be one path, as these pairs cannot."""
+    number = {stretch: i for i, stretch in enumerate(sorted(stretches))}
+    rivals = np.zeros((len(number), len(number)), dtype=bool)
+    for g, h in pairs:
+        rivals[number[g], number[h]] = True
+    named = list(number)
+    return [named[i] for i in large_clique(rivals)]
 
 
 def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:

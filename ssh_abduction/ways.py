@@ -221,6 +221,6 @@ class WaysEngine(NamedEngine):
     def _maps(self, labels: Sequence[int], mode: str, conflicts: int = -1, options: Sequence[str] = ()) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
         control = self._least_courses(labels, options)
-        reader = facts.StreetReader(control, self._trace, self._chart, labels)
+        reader = facts.StreetReader(control, self._trace, self._theory, self._chart, labels)
         answers = self._answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
         return (yield from mapped(lambda answer: Found.of(reader.map_of(answer).without_headings(), self._theory), answers))

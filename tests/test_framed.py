@@ -358,6 +358,24 @@ def test_mazes_are_mapped(seed: int, counts: tuple[int, int, int]) -> None:
         assert check(walk.trace, ssh_map, Theory.topological()) == ()
 
 
+@pytest.mark.parametrize(("seed", "pinned", "stretches"), [(13, 4, 7), (14, 4, 6), (41, 3, 5)])
+def test_pinned_stretches_leave_all_maps(seed: int, pinned: int, stretches: int) -> None:
+    trace = maze(4, 4, steps=100, seed=seed, stars=True).trace
+    given: list[tuple[list[int], Sequence[int]]] = []
+
+    def rivals(among: Sequence[int], pairs: Sequence[tuple[int, int]], sought: Callable[..., list[int]] = streets._rivals) -> list[int]:
+        found = sought(among, pairs)
+        assert set(combinations(found, 2)) <= set(pairs)
+        given.append((found, among))
+        return found
+
+    with patch.object(streets, "_rivals", rivals):
+        maps = solve(trace, maps=0).maps
+    assert any((len(found), len(among)) == (pinned, stretches) for found, among in given)
+    assert len(maps) > 1
+    assert set(maps) == set(solve(trace, maps=0, speedups=Speedups.without("clique")).maps)
+
+
 def test_what_is_not_told_beforehand_is_found() -> None:
     """Every answer is refused until clingo was told what order and sides forbid; the maps are the same."""
     walk = maze(2, 2, steps=60, seed=1, stars=True)
