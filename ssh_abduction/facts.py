@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from itertools import pairwise, permutations
 from typing import TypeAlias
@@ -496,14 +496,18 @@ class StreetReader:
         number = {label: i for i, label in enumerate(first)}
         self._labels = tuple(number[labels[node]] for node in chart.node_of)
         self._links = links_of(self._labels, trace)
-        self._dstates = [(_view(trace, t), *stands[label], runs.get(label)) for label, t in first.items()]
-        # Stretches, each with a place that it passes:
-        self._passes = {(run[0], component): None for _, component, _, run in self._dstates if run is not None}
+        self._dstates = [(_view(trace, t), *stands[label]) for label, t in first.items()]
+        self._runs: dict[int, list[tuple[int, int]]] = {}  # of each stretch, the dstates on it, and whether they face its direction
+        for i, label in enumerate(first):
+            if label in runs:
+                stretch, direction = runs[label]
+                self._runs.setdefault(stretch, []).append((i, direction))
+        self._passes = {(stretch, self._dstates[i][1]): None for stretch, members in self._runs.items() for i, _ in members}
         self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
         self._total = theory.path_order == "total"
         self._before: dict[_Ahead, int] = {}  # literals, 0 for what is never so
         self._order: dict[tuple[int, tuple[int, ...]], list[int]] = {}  # of a path and its places, when they were last asked for
-        self._made: dict[tuple[object, ...], DState] = {}  # most dstates are the same in most maps
+        self._placed: dict[tuple[tuple[int, int], ...], _Placed] = {}  # places are the same in most maps
 
     def read(self, model: Model) -> StreetAnswer:
         """What an answer holds."""
@@ -536,26 +540,51 @@ class StreetReader:
 
     def map_of(self, answer: StreetAnswer) -> SSHMap:
         """The map that it describes."""
-        arrived: dict[int, tuple[int, int]] = {}  # of each place, its number and the slot that is faced first
+        places = tuple(answer.at.values())
+        placed = self._placed.get(places)
+        if placed is None:
+            placed = self._placed[places] = _Placed.of(self._dstates, answer.at)
         faced: dict[int, tuple[int, int]] = {}  # of each path, its number and the direction that is faced first
-        dstates: list[DState] = []
-        for view, component, slot, run in self._dstates:
-            p, turned = answer.at[component]
-            place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
-            path = direction = None
-            if run is not None:
-                h, ahead = answer.part[run[0]]
-                ahead *= run[1]
-                path, first = faced.setdefault(h, (len(faced), ahead))
-                direction = ahead * first
-            key = len(dstates), view, place, path, direction, (slot + turned - facing) % 4
-            dstate = self._made.get(key)
-            if dstate is None:
-                dstate = self._made[key] = DState(*key)
-            dstates.append(dstate)
-        orders = ((path, [arrived[p][0] for p in answer.order[h][::first]]) for h, (path, first) in faced.items())
+        dstates = list(placed.dstates)
+        for stretch, members in self._runs.items():
+            h, ahead = answer.part[stretch]
+            path, first = faced.setdefault(h, (len(faced), ahead * members[0][1]))
+            key = stretch, path, ahead * first
+            if key not in placed.along:
+                placed.along[key] = [(i, replace(dstates[i], path=path, direction=key[2] * direction)) for i, direction in members]
+            for i, dstate in placed.along[key]:
+                dstates[i] = dstate
+        orders = ((path, [placed.number[p] for p in answer.order[h][::first]]) for h, (path, first) in faced.items())
         paths = tuple(Path(path, tuple(order)) for path, order in orders)
-        return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(arrived))), paths)
+        return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(placed.number))), paths)
+
+
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """What the places of an answer tell of a map.
+
+    number   of each place
+    dstates  without paths
+    along    those on a stretch, by the stretch, the path that it is part of, and in which direction
+    """
+
+    number: dict[int, int]
+    dstates: list[DState]
+    along: dict[tuple[int, int, int], list[tuple[int, DState]]]
+
+    @staticmethod
+    def of(dstates: Iterable[tuple[str | int, int, int]], at: Mapping[int, tuple[int, int]]) -> _Placed:
+        """
+        dstates  the view of each, which place it is at, as the turns tell, and which slot of that it faces
+        at       as in StreetAnswer
+        """
+        arrived: dict[int, tuple[int, int]] = {}  # of each place, its number and the slot that is faced first
+        made: list[DState] = []
+        for view, component, slot in dstates:
+            p, turned = at[component]
+            place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
+            made.append(DState(len(made), view, place, heading=(slot + turned - facing) % 4))
+        return _Placed({p: number for p, (number, _) in arrived.items()}, made, {})
 
 
 class _Choices:
