@@ -506,8 +506,9 @@ class StreetReader:
         self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
         self._total = theory.path_order == "total"
         self._before: dict[_Ahead, int] = {}  # literals, 0 for what is never so
-        self._order: dict[tuple[int, tuple[int, ...]], list[int]] = {}  # of a path and its places, when they were last asked for
-        self._placed: dict[tuple[tuple[int, int], ...], _Placed] = {}  # places are the same in most maps
+        self._order: dict[int, list[int]] = {}  # of each path, its places when they were last asked for
+        self._placed: _Placed | None = None  # of the last map: places are mostly as in that
+        self._made: dict[tuple[object, ...], DState] = {}  # most dstates are the same in most maps
 
     def read(self, model: Model) -> StreetAnswer:
         """What an answer holds."""
@@ -515,11 +516,11 @@ class StreetReader:
         on: dict[int, dict[int, None]] = {}  # of each path, the places on it
         for stretch, component in self._passes:
             on.setdefault(part[stretch][0], {})[at[component][0]] = None
-        return StreetAnswer(at, part, {path: self._ordered(model, path, tuple(places)) for path, places in on.items()})
+        return StreetAnswer(at, part, {path: self._ordered(model, path, places) for path, places in on.items()})
 
-    def _ordered(self, model: Model, path: int, places: tuple[int, ...]) -> list[int]:
-        """The places of a path in order: mostly near that of the last answer in which it had these."""
-        order = list(self._order.get((path, places), places))
+    def _ordered(self, model: Model, path: int, places: Collection[int]) -> list[int]:
+        """The places of a path in order: mostly near that of the last answer."""
+        order = list(dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places]))
         if self._total:
             for i, place in enumerate(order):  # by insertion
                 to = i
@@ -528,7 +529,7 @@ class StreetReader:
                 order.insert(to, order.pop(i))
         else:
             order = _in_order(places, (pair for pair in permutations(places, 2) if self._is_before(model, (path, *pair))))
-        self._order[path, places] = order
+        self._order[path] = order
         return order
 
     def _is_before(self, model: Model, ahead: _Ahead) -> bool:
@@ -540,51 +541,56 @@ class StreetReader:
 
     def map_of(self, answer: StreetAnswer) -> SSHMap:
         """The map that it describes."""
-        places = tuple(answer.at.values())
-        placed = self._placed.get(places)
-        if placed is None:
-            placed = self._placed[places] = _Placed.of(self._dstates, answer.at)
+        placed = self._placed
+        if placed is None or placed.at != answer.at:
+            placed = self._placed = self._placed_at(answer.at)
         faced: dict[int, tuple[int, int]] = {}  # of each path, its number and the direction that is faced first
         dstates = list(placed.dstates)
         for stretch, members in self._runs.items():
             h, ahead = answer.part[stretch]
             path, first = faced.setdefault(h, (len(faced), ahead * members[0][1]))
             key = stretch, path, ahead * first
-            if key not in placed.along:
-                placed.along[key] = [(i, replace(dstates[i], path=path, direction=key[2] * direction)) for i, direction in members]
-            for i, dstate in placed.along[key]:
+            along = placed.along.get(key)
+            if along is None:
+                along = placed.along[key] = [(i, self._dstate(dstates[i], path, key[2] * direction)) for i, direction in members]
+            for i, dstate in along:
                 dstates[i] = dstate
         orders = ((path, [placed.number[p] for p in answer.order[h][::first]]) for h, (path, first) in faced.items())
         paths = tuple(Path(path, tuple(order)) for path, order in orders)
         return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(placed.number))), paths)
+
+    def _placed_at(self, at: dict[int, tuple[int, int]]) -> _Placed:
+        """What places tell."""
+        arrived: dict[int, tuple[int, int]] = {}  # of each place, its number and the slot that is faced first
+        dstates: list[DState] = []
+        for view, component, slot in self._dstates:
+            p, turned = at[component]
+            place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
+            dstates.append(DState(len(dstates), view, place, heading=(slot + turned - facing) % 4))
+        return _Placed(at, {p: number for p, (number, _) in arrived.items()}, dstates, {})
+
+    def _dstate(self, placed: DState, path: int, direction: int) -> DState:
+        """A dstate on a path."""
+        key = placed.id, placed.place, placed.heading, path, direction
+        if key not in self._made:
+            self._made[key] = replace(placed, path=path, direction=direction)
+        return self._made[key]
 
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
     """What the places of an answer tell of a map.
 
+    at       as in StreetAnswer
     number   of each place
     dstates  without paths
     along    those on a stretch, by the stretch, the path that it is part of, and in which direction
     """
 
+    at: dict[int, tuple[int, int]]
     number: dict[int, int]
     dstates: list[DState]
     along: dict[tuple[int, int, int], list[tuple[int, DState]]]
-
-    @staticmethod
-    def of(dstates: Iterable[tuple[str | int, int, int]], at: Mapping[int, tuple[int, int]]) -> _Placed:
-        """
-        dstates  the view of each, which place it is at, as the turns tell, and which slot of that it faces
-        at       as in StreetAnswer
-        """
-        arrived: dict[int, tuple[int, int]] = {}  # of each place, its number and the slot that is faced first
-        made: list[DState] = []
-        for view, component, slot in dstates:
-            p, turned = at[component]
-            place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
-            made.append(DState(len(made), view, place, heading=(slot + turned - facing) % 4))
-        return _Placed({p: number for p, (number, _) in arrived.items()}, made, {})
 
 
 class _Choices:
