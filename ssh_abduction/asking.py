@@ -342,6 +342,12 @@ def new_control(encoding: str, base: str, options: Sequence[str], speedups: Spee
     return control
 
 
+def give_threads(control: clingo.Control, *, two: bool) -> None:
+    """Let clasp search with two threads, which tell each other what they learn, or with one."""
+    configuration: Any = control.configuration.solve
+    configuration.parallel_mode = "2,compete" if two else "1"
+
+
 def has_processors(speedups: Speedups) -> bool:
     """Whether a search may have two threads."""
     if not speedups.threads:

@@ -418,9 +418,9 @@ def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nod
 
 def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
     """The stretches of streets.lp, and pairs of them that cannot be one path, in neither direction."""
-    stretches = [_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("stretch", 1)]
+    stretches = sorted(_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("stretch", 1))
     rivals = {tuple(_atom(atom.symbol)[1]) for atom in control.symbolic_atoms.by_signature("rival", 3)}
-    return stretches, [(g, h) for g, h, direction in rivals if g != h and direction == 1 and (g, h, -1) in rivals]
+    return stretches, [(g, h) for g, h, direction in rivals if direction == 1 and (g, h, -1) in rivals]
 
 
 def pinned_facts(stretches: Iterable[int]) -> str:

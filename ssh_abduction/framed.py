@@ -23,12 +23,11 @@ from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import chain, combinations, islice
-from typing import Any
 
 import clingo
 
 from ssh_abduction import encodings, facts
-from ssh_abduction.asking import Watch, mapped
+from ssh_abduction.asking import Watch, give_threads, mapped
 from ssh_abduction.chart import Chart, FramedChart, NoFrame, numbered
 from ssh_abduction.engine import Found
 from ssh_abduction.merging import kept
@@ -338,9 +337,8 @@ class FramedEngine(SameEngine):
     def _maps(self, naming: _Naming, mode: str, conflicts: int = -1) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
         control = naming.control or self._street_control(naming.labels)
-        configuration: Any = control.configuration.solve
         alone = mode == "opt" and len(set(naming.labels)) > MANY_DSTATES and not self._beside and self._has_processors()
-        configuration.parallel_mode = "2,compete" if alone else "1"  # two threads would keep all that they list
+        give_threads(control, two=alone)  # which keep all that they list
         reader = facts.StreetReader(control, self._trace, self._theory, self._chart, naming.labels)
         answers = self._answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
         return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), self._theory), answers))

@@ -44,7 +44,7 @@ import numpy as np
 from ssh_abduction import facts
 from ssh_abduction.annealing import annealed, annealed_steps
 from ssh_abduction.apart import Continuations, Matrix
-from ssh_abduction.asking import POLL, Stopped, Watch, new_control
+from ssh_abduction.asking import POLL, Stopped, Watch, give_threads, new_control
 from ssh_abduction.chart import Chart, Link, NoFrame, numbered
 from ssh_abduction.engine import AT_ONCE, ChartedEngine, Found
 from ssh_abduction.following import followed
@@ -352,7 +352,7 @@ class NamedEngine(ChartedEngine):
         if self._one_by_one:
             configuration.configuration, configuration.sat_prepro = "crafty", "no"
         if self._hard and not (self._beside and self._beside.running) and self._has_processors():
-            configuration.solve.parallel_mode = "2,compete"
+            give_threads(self._control, two=True)
 
     def _first_of_bound(self) -> dict[int, int]:
         """Raise the bound until there is a map that costs no more. All links are given."""

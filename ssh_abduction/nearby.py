@@ -34,7 +34,7 @@ import numpy as np
 
 from ssh_abduction import facts
 from ssh_abduction.apart import Matrix
-from ssh_abduction.asking import Asker, Stopped, Watch, has_processors, new_control
+from ssh_abduction.asking import Asker, Stopped, Watch, give_threads, has_processors, new_control
 from ssh_abduction.chart import Chart, numbered
 from ssh_abduction.speedups import Speedups
 
@@ -127,9 +127,7 @@ class NearbySearch(Asker):
         assert self.bound is not None
         spares = self.bound - len(self.clique)
         while True:
-            if has_processors(self._speedups):
-                configuration: Any = self._control.configuration.solve
-                configuration.parallel_mode = "2,compete"
+            give_threads(self._control, two=has_processors(self._speedups))
             with closing(self._answers(facts.read_names, f"enum,{spares},{spares}", 0, assumptions=[self._ordered])) as answers:
                 for answer in answers:
                     if resting := self._rests.intersection(answer.values()):

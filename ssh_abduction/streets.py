@@ -186,12 +186,11 @@ class Streets:
 
 def _rivals(stretches: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
     """As many stretches as are soon found no two of which can be one path, as these pairs cannot."""
-    number = {stretch: i for i, stretch in enumerate(sorted(stretches))}
-    rivals = np.zeros((len(number), len(number)), dtype=bool)
+    number = {stretch: i for i, stretch in enumerate(stretches)}
+    rivals = np.zeros((len(stretches), len(stretches)), dtype=bool)
     for g, h in pairs:
         rivals[number[g], number[h]] = True
-    named = list(number)
-    return [named[i] for i in large_clique(rivals)]
+    return [stretches[i] for i in large_clique(rivals)]
 
 
 def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:
