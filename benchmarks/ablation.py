@@ -19,7 +19,7 @@ from bench import machine, packages, run, store
 from suite import BARE, INSTANCES, SMALL, Instance
 from table import OURS, WITHOUT, times
 
-from ssh_abduction.speedups import SPEEDUPS
+from ssh_abduction.theory.speedups import SPEEDUPS
 
 CAUSAL = ["rectangle n=400", "rectangle n=40000", "moore 8/2 n=800", "moore 30/10 n=200", "moore 100/10 n=3200"]
 CAUSAL += ["maze 2x2 n=1600", "maze 3x3 n=1600", "maze 4x4 n=1600"]

@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.checker import check
 from ssh_abduction.cli.text import describe, differences
+from ssh_abduction.judge.checker import check
 from ssh_abduction.picture import svg
 
 

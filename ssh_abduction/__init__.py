@@ -1,13 +1,13 @@
 """From what a robot saw and did, find the map: every minimal map of distinctive states, places and paths."""
 
-from ssh_abduction.certificate import Certificate
-from ssh_abduction.engine import Cost
+from ssh_abduction.engines.base import Cost
 from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
 from ssh_abduction.maps import DState, Path, SSHMap
-from ssh_abduction.online import OnlineMapper
-from ssh_abduction.solver import Bound, Progress, Search, Solution, Status, solve
-from ssh_abduction.speedups import Speedups
-from ssh_abduction.theory import Theory
+from ssh_abduction.online.mapper import OnlineMapper
+from ssh_abduction.solver.search import Bound, Progress, Search, Solution, Status, solve
+from ssh_abduction.steps.certificate import Certificate
+from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Action, Step, Trace
 
 __all__ = [

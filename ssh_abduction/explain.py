@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 
 import clingo
 
-from ssh_abduction import encodings, facts
-from ssh_abduction.theory import Theory
+from ssh_abduction.asp import facts
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
 POLL = 0.05  # seconds between two questions whether to stop

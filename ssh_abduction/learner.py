@@ -22,8 +22,8 @@ from perception.recognition import recogniser
 from perception.views import ViewClusterer
 from ssh_abduction.errors import SSHError
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.solver import solve
-from ssh_abduction.theory import Theory
+from ssh_abduction.solver.search import solve
+from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
 

@@ -21,7 +21,7 @@ from itertools import combinations, product
 from typing import NamedTuple, TypeAlias
 
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.theory import Theory
+from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Action, Openings, Trace
 
 Labels: TypeAlias = tuple[int, ...]

@@ -6,7 +6,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from ssh_abduction.theory import COUNTS, Count, Theory
+from ssh_abduction.theory.theory import COUNTS, Count, Theory
 from ssh_abduction.trace import STANDARD_ACTIONS, Action, Trace
 
 ACTIONS = (*STANDARD_ACTIONS.values(), Action("creep", "travel"), Action("veer", "turn", "right"))

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from worlds import ACTIONS
 
-from ssh_abduction import Theory, Trace, encodings, solve
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.theory import encodings
 
 PLAIN = Theory.topological()
 NO_SIDES = PLAIN.replace(boundary="none")

@@ -19,7 +19,7 @@ from peers import PEERS, Machine, Words
 from suite import SUITE
 
 from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.speedups import SPEEDUPS
+from ssh_abduction.theory.speedups import SPEEDUPS
 
 ROOT = Path(__file__).parent.parent
 STORED = sorted((ROOT / "benchmarks" / "results").glob("*.json"))

@@ -6,7 +6,7 @@ import pytest
 from brute_force import consistent_maps, key, minimal_maps
 
 from ssh_abduction.maps import DState, Path, SSHMap
-from ssh_abduction.theory import Theory
+from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import STANDARD_ACTIONS, Action, Trace
 
 LETTERS = {

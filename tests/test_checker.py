@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssh_abduction import encodings
-from ssh_abduction.checker import AXIOMS, COHERENCE, Violation, check
+from ssh_abduction.judge.checker import AXIOMS, COHERENCE, Violation, check
 from ssh_abduction.maps import DState, Path, SSHMap
-from ssh_abduction.theory import Theory
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
 ACTIONS = {"T": "travel", "R": "right", "L": "left", "A": "around"}

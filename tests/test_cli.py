@@ -18,8 +18,9 @@ import networkx as nx
 import pytest
 from worlds import TOURS, drive, rectangle
 
-from ssh_abduction import SSHMap, Theory, Trace, encodings, solve
+from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
+from ssh_abduction.theory import encodings
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ACES = str(EXAMPLES / "aces3-route.jsonl")

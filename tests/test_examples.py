@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ssh_abduction import Status, Theory, Trace, solve
-from ssh_abduction.checker import check
+from ssh_abduction.judge.checker import check
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -10,12 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.instances import maze
-from ssh_abduction import Theory, Trace, facts, following, solve
-from ssh_abduction.chart import Chart, numbered
-from ssh_abduction.checker import check
-from ssh_abduction.following import followed
-from ssh_abduction.merging import thinned
-from ssh_abduction.replay import Log
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.asp import facts
+from ssh_abduction.guesses import tree as following
+from ssh_abduction.guesses.merging import thinned
+from ssh_abduction.guesses.tree import followed
+from ssh_abduction.judge.checker import check
+from ssh_abduction.steps.chart import Chart, numbered
+from ssh_abduction.steps.log import Log
 from tests.strategies import traces
 
 CAUSAL = Theory.causal()

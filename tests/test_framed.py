@@ -32,18 +32,18 @@ from ssh_abduction import (
     solver,
     streets,
 )
-from ssh_abduction.annealing import Guess, attempts
-from ssh_abduction.asking import Stopped, Watch
-from ssh_abduction.chart import QUARTERS, Chart, FramedChart, NoFrame, numbered
-from ssh_abduction.checker import check
-from ssh_abduction.engine import Cost, Found
-from ssh_abduction.framed import FramedEngine
+from ssh_abduction.asp.asking import Stopped, Watch
+from ssh_abduction.engines.base import Cost, Found
+from ssh_abduction.engines.framed import FramedEngine
+from ssh_abduction.engines.nearby import Beside, NearbySearch
+from ssh_abduction.guesses.annealing import Guess, attempts
+from ssh_abduction.guesses.merging import kept, merged_near
+from ssh_abduction.judge.checker import check
+from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.merging import kept, merged_near
-from ssh_abduction.nearby import Beside, NearbySearch
-from ssh_abduction.proof import check_bound
-from ssh_abduction.replay import Log
-from ssh_abduction.speedups import SPEEDUPS
+from ssh_abduction.steps.chart import QUARTERS, Chart, FramedChart, NoFrame, numbered
+from ssh_abduction.steps.log import Log
+from ssh_abduction.theory.speedups import SPEEDUPS
 
 PLAIN = Speedups.without(SPEEDUPS)
 

@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import theories, traces
 
-from ssh_abduction import OnlineMapper, Search, Speedups, SSHMap, Status, Theory, Trace, framing, solve, solver
-from ssh_abduction.asking import Paused, Stopped, Watch
-from ssh_abduction.checker import check
-from ssh_abduction.framing import maps_with_frames
-from ssh_abduction.sketch import Sketch
-from ssh_abduction.speedups import SPEEDUPS
+from ssh_abduction import OnlineMapper, Search, Speedups, SSHMap, Status, Theory, Trace, solve
+from ssh_abduction.asp.asking import Paused, Stopped, Watch
+from ssh_abduction.engines import framing
+from ssh_abduction.engines.framing import maps_with_frames
+from ssh_abduction.guesses.continuing import Sketch
+from ssh_abduction.judge.checker import check
+from ssh_abduction.solver.search import search as solver
+from ssh_abduction.theory.speedups import SPEEDUPS
 
 THEORIES = {
     "dstates": Theory.topological(),

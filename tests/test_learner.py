@@ -21,8 +21,8 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Step, Theory, Trace, solve
 from ssh_abduction import learner as learner_module
-from ssh_abduction.checker import check
 from ssh_abduction.cli import main
+from ssh_abduction.judge.checker import check
 from ssh_abduction.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, labels_of
 from ssh_abduction.reproduce.claims import EXPERIMENTS, claims, one_to_one, outcome, rate, summary, true_dstates
 

@@ -10,15 +10,17 @@ from unittest.mock import patch
 import pytest
 
 from benchmarks.instances import Walk, maze
-from ssh_abduction import Search, Theory, same, solve, streets
-from ssh_abduction.asking import Watch
-from ssh_abduction.chart import Chart, FramedChart, numbered
-from ssh_abduction.checker import check
-from ssh_abduction.framed import FramedEngine
-from ssh_abduction.localising import Located, State, faced, located, states_of, tracked
-from ssh_abduction.replay import Log
-from ssh_abduction.speedups import Speedups
-from ssh_abduction.streets import Streets
+from ssh_abduction import Search, Theory, solve
+from ssh_abduction.asp.asking import Watch
+from ssh_abduction.engines import streets
+from ssh_abduction.engines import visits as same
+from ssh_abduction.engines.framed import FramedEngine
+from ssh_abduction.engines.streets import Streets
+from ssh_abduction.judge.checker import check
+from ssh_abduction.steps.chart import Chart, FramedChart, numbered
+from ssh_abduction.steps.localising import Located, State, faced, located, states_of, tracked
+from ssh_abduction.steps.log import Log
+from ssh_abduction.theory.speedups import Speedups
 
 FRAMED = Theory(star="frame")
 

@@ -13,13 +13,19 @@ from hypothesis import strategies as st
 from instances import maze, moore
 from test_speedups import PLAIN, machines
 
-from ssh_abduction import Speedups, Status, Theory, Trace, annealing, engine, facts, named, nearby, solve, solver
-from ssh_abduction.annealing import annealed
-from ssh_abduction.asking import Watch
-from ssh_abduction.chart import Chart, NoFrame
-from ssh_abduction.checker import check
-from ssh_abduction.nearby import Beside, NearbySearch
-from ssh_abduction.replay import Log
+from ssh_abduction import Speedups, Status, Theory, Trace, solve
+from ssh_abduction.asp import facts
+from ssh_abduction.asp.asking import Watch
+from ssh_abduction.engines import base as engine
+from ssh_abduction.engines import causal as named
+from ssh_abduction.engines import nearby
+from ssh_abduction.engines.nearby import Beside, NearbySearch
+from ssh_abduction.guesses import annealing
+from ssh_abduction.guesses.annealing import annealed
+from ssh_abduction.judge.checker import check
+from ssh_abduction.solver.search import search as solver
+from ssh_abduction.steps.chart import Chart, NoFrame
+from ssh_abduction.steps.log import Log
 
 CAUSAL = Theory.causal()
 

@@ -15,12 +15,14 @@ from instances import maze
 from strategies import theories, traces
 from worlds import TOURS, drive, rectangle
 
-from ssh_abduction import Action, OnlineMapper, Solution, Status, Theory, TheoryError, Trace, TraceError, guessing, online, solve
-from ssh_abduction.chart import Chart
-from ssh_abduction.checker import check
-from ssh_abduction.replay import Log
-from ssh_abduction.sketch import Sketch
-from ssh_abduction.speedups import Speedups
+from ssh_abduction import Action, OnlineMapper, Solution, Status, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction.guesses.continuing import Sketch
+from ssh_abduction.judge.checker import check
+from ssh_abduction.online.mapper import background as guessing
+from ssh_abduction.online.mapper import mapper as online
+from ssh_abduction.steps.chart import Chart
+from ssh_abduction.steps.log import Log
+from ssh_abduction.theory.speedups import Speedups
 
 NO_TIME = 1e-9  # seconds: every search is stopped before it begins
 
@@ -264,7 +266,8 @@ def test_a_guess_ends_with_its_mapper_and_with_the_program() -> None:
     program = """
 import threading
 from instances import maze
-from ssh_abduction import OnlineMapper, guessing
+from ssh_abduction import OnlineMapper
+from ssh_abduction.online.mapper import background as guessing
 guessing.has_processors = lambda _: True
 
 def begun():

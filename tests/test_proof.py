@@ -18,10 +18,10 @@ from test_speedups import machines
 from worlds import rectangle
 
 from ssh_abduction import MapError, OnlineMapper, Search, Theory, Trace, solve
-from ssh_abduction.apart import Continuations
 from ssh_abduction.cli import main
-from ssh_abduction.proof import check_bound
-from ssh_abduction.replay import Log
+from ssh_abduction.judge.proof import check_bound
+from ssh_abduction.steps.apart import Continuations
+from ssh_abduction.steps.log import Log
 
 
 @settings(deadline=None, derandomize=True)
@@ -86,7 +86,9 @@ def test_a_short_trace_is_solved_without_numpy() -> None:
     """It takes longer to load than all the rest."""
     program = textwrap.dedent("""
         import sys
-        from ssh_abduction import Trace, cli, solve
+        from ssh_abduction import Trace
+        from ssh_abduction import cli
+        from ssh_abduction import solve
         solution = solve(Trace.from_steps("aba", ["travel", "travel"]))
         print("numpy" in sys.modules)
         print(solution.certificate.clique, "numpy" in sys.modules)

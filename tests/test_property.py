@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import theories, traces
 
-from ssh_abduction import solve, solver
-from ssh_abduction.checker import check
-from ssh_abduction.theory import Count, Theory
+from ssh_abduction import solve
+from ssh_abduction.judge.checker import check
+from ssh_abduction.solver.search import search as solver
+from ssh_abduction.theory.theory import Count, Theory
 from ssh_abduction.trace import Trace
 
 LIMIT = 10  # seconds: a search that does not end is a failure, not a hang

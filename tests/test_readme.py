@@ -14,7 +14,7 @@ import pytest
 
 from ssh_abduction.cli import main
 from ssh_abduction.picture import svg
-from ssh_abduction.solver import Status, solve
+from ssh_abduction.solver.search import Status, solve
 from ssh_abduction.trace import Trace
 
 ROOT = Path(__file__).parent.parent

@@ -16,15 +16,20 @@ from hypothesis import strategies as st
 from instances import maze, moore
 from strategies import traces
 
-from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, annealing, engine, facts, named, solve, solver
-from ssh_abduction.annealing import annealed_steps
-from ssh_abduction.apart import Continuations, clique
-from ssh_abduction.asking import Stopped
-from ssh_abduction.chart import Chart
-from ssh_abduction.checker import check
-from ssh_abduction.merging import merged, thinned
-from ssh_abduction.nearby import NearbySearch
-from ssh_abduction.replay import Log
+from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, solve
+from ssh_abduction.asp import facts
+from ssh_abduction.asp.asking import Stopped
+from ssh_abduction.engines import base as engine
+from ssh_abduction.engines import causal as named
+from ssh_abduction.engines.nearby import NearbySearch
+from ssh_abduction.guesses import annealing
+from ssh_abduction.guesses.annealing import annealed_steps
+from ssh_abduction.guesses.merging import merged, thinned
+from ssh_abduction.judge.checker import check
+from ssh_abduction.solver.search import search as solver
+from ssh_abduction.steps.apart import Continuations, clique
+from ssh_abduction.steps.chart import Chart
+from ssh_abduction.steps.log import Log
 
 NAMES = [f.name for f in fields(Speedups)]
 PLAIN = Speedups.without(NAMES)

@@ -11,13 +11,16 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import traces
 
-from ssh_abduction import Search, Speedups, Status, Theory, Trace, named, solve, solver, ways
-from ssh_abduction.asking import Watch
-from ssh_abduction.checker import check
-from ssh_abduction.proof import check_bound
-from ssh_abduction.replay import Log
-from ssh_abduction.speedups import SPEEDUPS
-from ssh_abduction.ways import WaysEngine
+from ssh_abduction import Search, Speedups, Status, Theory, Trace, solve
+from ssh_abduction.asp.asking import Watch
+from ssh_abduction.engines import causal as named
+from ssh_abduction.engines import frameless as ways
+from ssh_abduction.engines.frameless import WaysEngine
+from ssh_abduction.judge.checker import check
+from ssh_abduction.judge.proof import check_bound
+from ssh_abduction.solver.search import search as solver
+from ssh_abduction.steps.log import Log
+from ssh_abduction.theory.speedups import SPEEDUPS
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 PLAIN = Speedups.without(SPEEDUPS)

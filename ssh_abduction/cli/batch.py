@@ -27,9 +27,9 @@ from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.solve import dump, ending, exit_code, explained, on_ctrl_c, opening
 from ssh_abduction.cli.text import headline
 from ssh_abduction.errors import SolverError, SSHError, brief, named
-from ssh_abduction.solver import Search
-from ssh_abduction.speedups import Speedups
-from ssh_abduction.theory import Theory
+from ssh_abduction.solver.search import Search
+from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:

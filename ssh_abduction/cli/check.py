@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from ssh_abduction.certificate import RESTS_ON
-from ssh_abduction.checker import check
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.text import counted
 from ssh_abduction.errors import MapError
+from ssh_abduction.judge.checker import check
+from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.maps import maps_of, read_json
-from ssh_abduction.proof import check_bound
-from ssh_abduction.theory import Theory
+from ssh_abduction.steps.certificate import RESTS_ON
+from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
 EXIT_VIOLATED = 20

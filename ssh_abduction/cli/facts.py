@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from ssh_abduction.asp.facts import program
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
-from ssh_abduction.facts import program
 from ssh_abduction.trace import Trace
 
 

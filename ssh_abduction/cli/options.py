@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ssh_abduction.errors import MapError
-from ssh_abduction.theory import CHOICES, COUNTS, PRESETS, Theory
+from ssh_abduction.theory.theory import CHOICES, COUNTS, PRESETS, Theory
 from ssh_abduction.trace import Trace
 
 Verbs = Any  # argparse's type for what add_subparsers returns is private

@@ -17,8 +17,8 @@ from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.text import describe, differences, headline
 from ssh_abduction.explain import Explanation, Interrupted, explain
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.solver import Progress, Search, Solution, Status
-from ssh_abduction.speedups import SPEEDUPS, Speedups
+from ssh_abduction.solver.search import Progress, Search, Solution, Status
+from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 from ssh_abduction.trace import Trace
 
 EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}

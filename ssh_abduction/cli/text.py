@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ssh_abduction.explain import Explanation
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.solver import Solution, Status
+from ssh_abduction.solver.search import Solution, Status
 from ssh_abduction.trace import Trace
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction import encodings
 from ssh_abduction.cli.options import Verbs
 from ssh_abduction.cli.text import table
-from ssh_abduction.theory import PRESETS
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.theory import PRESETS
 
 
 def add_parser(verbs: Verbs) -> None:

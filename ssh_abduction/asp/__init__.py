@@ -1,0 +1,1 @@
+"""clingo under limits, and what passes between it and Python."""

@@ -1,0 +1,653 @@
+"""Between Python and clingo: a trace becomes facts, an answer set becomes a map. No other module knows a predicate's name."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from itertools import pairwise, permutations
+from typing import TypeAlias
+
+from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
+
+from ssh_abduction.maps import DState, Path, SSHMap
+from ssh_abduction.steps.chart import Chart, FramedChart
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Action, Trace
+
+_COURSE = {"pos": 1, "neg": -1}
+
+_Ahead: TypeAlias = tuple[int, int, int]  # a path, and two places of which the first is before the other
+
+
+def encoding_names(theory: Theory) -> tuple[str, ...]:
+    """The encodings that a theory needs, in the order to load them."""
+    names = ["causal"]
+    if theory.level == "topological":
+        names += ["topological"]
+        names += ["boundary"] if theory.boundary != "none" else []
+        names += ["star"] if theory.star in ("pattern", "frame") else []
+    return (*names, "preference", "show")
+
+
+def theory_facts(theory: Theory, paths: int) -> str:
+    """The axioms and the preference of a theory, and names for so many paths, as facts."""
+    facts = [f"axiom({name})." for name in theory.axioms]
+    facts += [f"path(1..{paths})."] if theory.level == "topological" else []
+    facts += _preferred(theory)
+    facts += ["defeasible."] if theory.boundary == "defeasible" else []
+    return "\n".join(facts)
+
+
+def _preferred(theory: Theory) -> list[str]:
+    return [f"prefer({count},{len(theory.priorities) - i})." for i, count in enumerate(theory.priorities)]
+
+
+def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
+    """The most paths that a map of the first steps can have: a path begins at the start, or where a turn right or left ends."""
+    if theory.without:
+        return steps
+    return 1 + sum(action.turn in ("right", "left") for action in trace.actions[: steps - 1])
+
+
+def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
+    """What happened in steps `start` to `stop - 1`, and the links between them and from the step before, as facts."""
+    facts = []
+    for t in range(start, stop):
+        step = trace.steps[t]
+        assert step.view is not None
+        facts.append(f"view({t},{_constant(step.view)}).")
+        if theory.star in ("pattern", "frame"):
+            facts += [f"open({t},{slot})." for slot, is_open in enumerate(step.openings or ()) if is_open]
+    done = {t: trace.actions[t] for t in range(max(start - 1, 0), stop - 1)}
+    facts += [f"act({t},{_constant(action.name)})." for t, action in done.items()]
+    if theory.level == "topological":
+        facts += [_kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None]
+    return "\n".join(facts)
+
+
+def program(trace: Trace, theory: Theory) -> str:
+    """A trace and a resolved theory as the facts that `encodings/run.py` solves."""
+    files = " ".join(f"{name}.lp" for name in encoding_names(theory))
+    return "\n".join(
+        [
+            f"% {len(trace)} steps{f' of {trace.name!r}' if trace.name else ''}. In {encodings.folder()}, run",
+            f"%   python run.py --project=project --opt-mode=optN -n 0 THIS_FILE {files}",
+            theory_facts(theory, most_paths(trace, theory, len(trace))),
+            trace_facts(trace, theory, 0, len(trace)),
+            "",
+        ]
+    )
+
+
+def query(t: int) -> Symbol:
+    """The external atom that makes t the last step."""
+    return Function("query", numbers(t))
+
+
+def active(axiom: str, t: int) -> Symbol:
+    """The atom of an explanation that makes an axiom hold at step t."""
+    return Function("active", [Function(axiom), *numbers(t)])
+
+
+def _constant(value: str | int) -> str:
+    return str(Number(value) if isinstance(value, int) else String(value))
+
+
+def _kind_fact(action: Action) -> str:
+    return f"kind({_constant(action.name)},travel)." if action.kind == "travel" else f"turns({_constant(action.name)},{action.turn})."
+
+
+@lru_cache(maxsize=2**14)
+def _atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
+    """The name and the arguments of an atom of a map. Kept, as maps have most atoms in common, and each part is a call to clingo."""
+    return symbol.name, tuple(arg.number if arg.type is SymbolType.Number else _COURSE[arg.name] for arg in symbol.arguments)
+
+
+def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
+    """The map that an answer set describes, for the steps it speaks of."""
+    is_at: dict[int, int] = {}
+    place: dict[int, int] = {}
+    course: dict[int, tuple[int, int]] = {}
+    heading: dict[int, int] = {}
+    before: list[tuple[int, int, int]] = []
+    excused: list[tuple[int, int]] = []
+    for name, args in map(_atom, model.symbols(shown=True)):
+        if name == "is":
+            is_at[args[0]] = args[1]
+        elif name == "at":
+            place[args[0]] = args[1]
+        elif name == "along":
+            course[args[0]] = (args[1], args[2])
+        elif name == "before":
+            before.append((args[0], args[1], args[2]))
+        elif name == "heading":
+            heading[args[0]] = args[1]
+        elif name == "excused":
+            excused.append((args[0], args[1]))
+    return _map(trace, is_at, place, course, heading, before, excused)
+
+
+def _map(
+    trace: Trace,
+    is_at: Mapping[int, int],
+    place: Mapping[int, int],
+    course: Mapping[int, tuple[int, int]],
+    heading: Mapping[int, int],
+    before: Iterable[tuple[int, int, int]],
+    excused: Iterable[tuple[int, int]] = (),
+) -> SSHMap:
+    """The map of these dstates, places, courses and headings of steps; dstates and places are named by the first step at them."""
+    names = sorted(set(is_at.values()))
+    dstate_of = {name: i for i, name in enumerate(names)}
+    place_of = {name: i for i, name in enumerate(sorted({place[s] for s in names if s in place}))}
+    path_of = {name: i for i, name in enumerate(sorted({course[s][0] for s in names if s in course}))}
+    dstates = tuple(
+        DState(
+            id=dstate_of[s],
+            view=_view(trace, s),
+            place=place_of[place[s]] if s in place else None,
+            path=path_of[course[s][0]] if s in course else None,
+            direction=course[s][1] if s in course else None,
+            heading=heading.get(s),
+        )
+        for s in names
+    )
+    labels = tuple(dstate_of[is_at[t]] for t in range(len(is_at)))
+    pairs = [(path_of[h], place_of[p], place_of[q]) for h, p, q in before if h in path_of and p in place_of and q in place_of]
+    return SSHMap(
+        labels=labels,
+        dstates=dstates,
+        links=links_of(labels, trace),
+        places=tuple(place_of.values()),
+        paths=_paths(len(path_of), dstates, pairs),
+        excused=tuple(sorted((path_of[h], path_of[g]) for h, g in excused if h in path_of and g in path_of)),
+    )
+
+
+def name_facts(
+    names: Iterable[tuple[int, int]],
+    spares: Collection[Sequence[int]],
+    links: Iterable[tuple[int, int, int]],
+    choices: Sequence[Sequence[int]],
+    ordered: bool = True,
+) -> str:
+    """Names with their views; for each view its spare names, the last for the rest; and where an action at a name can lead.
+
+    choices  of each node, the names that it can be at
+    ordered  whether steps are at spare names in the order of the names; if not, that may be assumed
+    """
+    view_of = dict(names)
+    rests = {spare[-1] for spare in spares}
+    leads = {(s, action, x) for t, action, u in links for s in choices[t] if s not in rests for x in choices[u]}
+    facts = [f"view({name},{view})." for name, view in view_of.items()]
+    for spare in spares:
+        facts += [f"spare({name})." for name in spare] + [f"after({r},{s})." for r, s in pairwise(spare)] + [f"rest({spare[-1]})."]
+    facts += [f"leads({s},{action},{x})." for s, action, x in leads]
+    facts += [f"shows({s},{action},{view})." for s, action, view in {(s, action, view_of[x]) for s, action, x in leads}]
+    facts += ["ordered." if ordered else "{ ordered }."]
+    return "\n".join(facts)
+
+
+def batch_facts(
+    batch: int,
+    nodes: Iterable[tuple[int, int, Sequence[int], int | None]],
+    links: Iterable[tuple[int, int, int]],
+    apart: Iterable[tuple[int, int]],
+) -> str:
+    """Nodes, each with its view, the names it can be at, and the node of that view before it; links with their actions; and pairs that are apart."""
+    facts = []
+    for t, view, names, before in nodes:
+        facts.append(f"node({batch},{t},{view}).")
+        facts += [f"may_be({t},{name})." for name in names]
+        facts += [f"follows({before},{t})."] if before is not None and len(names) > 1 else []
+    facts += [f"link({batch},{t},{action},{u})." for t, action, u in links]
+    facts += [f"apart({batch},{t},{u})." for t, u in apart]
+    return "\n".join(facts)
+
+
+def watched() -> Symbol:
+    """The external atom that makes constraints of three literals longer, so that clasp watches them."""
+    return Function("watched")
+
+
+def resting(batch: int) -> Symbol:
+    """The atom that holds if a step of the batches up to this one is at the rest of its view. Assumed by who asks for such a map."""
+    return Function("resting", numbers(batch))
+
+
+def ordered() -> Symbol:
+    """The atom that steps are at spare names in the order of the names."""
+    return Function("ordered")
+
+
+def named(t: int, name: int) -> Symbol:
+    """The atom that step t is at the dstate of that name."""
+    return Function("is", numbers(t, name))
+
+
+def used(name: int) -> Symbol:
+    """The atom that a spare name is used."""
+    return Function("used", numbers(name))
+
+
+def read_names(model: Model) -> dict[int, int]:
+    """The name of each step that an answer set of names.lp speaks of."""
+    return dict(map(_named, model.symbols(shown=True)))
+
+
+@lru_cache(maxsize=2**16)
+def _named(symbol: Symbol) -> tuple[int, int]:
+    """A step and its name. Kept, as answers that follow each other have most atoms in common, and each part is a call to clingo."""
+    step, name = symbol.arguments
+    return step.number, name.number
+
+
+class NameReader:
+    """Reads answers of names.lp to which all links of a trace are given: where actions lead tells the name of each step, and takes less time to ask for.
+
+    actions  after each step but the last, as numbers
+    choices  of each step, the names that it can be at
+    rests    the names for a rest
+    """
+
+    def __init__(self, actions: Sequence[int], choices: Sequence[Sequence[int]], rests: Collection[int]) -> None:
+        self._actions = actions
+        self._choices = choices
+        self._rests = rests
+        self._last: dict[tuple[int, int], tuple[int, int]] = {}  # where an action at a name led last, and the literal of that
+
+    def read(self, model: Model) -> dict[int, int]:
+        """The name of each step."""
+        atoms = model.context.symbolic_atoms
+        leads: dict[tuple[int, int], int] = {}
+        name = next(s for s in self._choices[0] if (atom := atoms[named(0, s)]) and model.is_true(atom.literal))
+        names = {0: name}
+        for t, action in enumerate(self._actions, 1):
+            if name in self._rests:
+                return read_names(model)
+            key = name, action
+            if key not in leads:
+                there, literal = self._last.get(key, (-1, 0))
+                if not literal or not model.is_true(literal):
+                    asked = ((x, atoms[Function("goes", numbers(*key, x))]) for x in self._choices[t])
+                    there, literal = next((x, atom.literal) for x, atom in asked if atom and model.is_true(atom.literal))
+                    self._last[key] = there, literal
+                leads[key] = there
+            names[t] = name = leads[key]
+        return names
+
+
+def visit_facts(
+    batch: int,
+    nodes: Iterable[tuple[int, int, int]],
+    leaves: Iterable[tuple[int, int, int]],
+    fits: Iterable[tuple[int, int, int]],
+    unfit: Iterable[tuple[int, int, int]] = (),
+) -> str:
+    """What is new of visits: numbered nodes with visit and slot, where visits end and how, which pairs may be one, and which no longer."""
+    new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit}
+    return "\n".join(f"{name}({batch},{','.join(map(str, args))})." for name, rows in new.items() for args in rows)
+
+
+def same(pair: tuple[int, int, int]) -> Symbol:
+    """The atom that two visits are the same, so turned."""
+    return Function("same", numbers(*pair))
+
+
+def read_same(atom: Symbol) -> tuple[int, int, int]:
+    """The two visits, and how turned, of such an atom."""
+    first, second, turned = (argument.number for argument in atom.arguments)
+    return first, second, turned
+
+
+def listed(batch: int) -> Symbol:
+    """The external atom that answers for the batches up to this one are listed."""
+    return Function("listed", numbers(batch))
+
+
+def alone(place: int) -> Symbol:
+    """The atom that the node at this place of the order is the first at its dstate."""
+    return Function("alone", numbers(place))
+
+
+def over(core: int, count: int) -> Symbol:
+    """The atom that so many members of a core are there."""
+    return Function("over", numbers(core, count))
+
+
+def read_over(member: Symbol) -> tuple[int, int] | None:
+    """The core and the count of such an atom; None for another."""
+    return (member.arguments[0].number, member.arguments[1].number) if member.name == "over" else None
+
+
+def core_facts(core: int, members: Iterable[Symbol]) -> str:
+    """The members of a core."""
+    return "\n".join(f"member({core},{member})." for member in members)
+
+
+def three_facts(batch: int, threes: Iterable[tuple[int, ...]]) -> str:
+    """Visits of which it matters that to be the same is transitive."""
+    return "\n".join(f"via({batch},{','.join(map(str, three))})." for three in threes)
+
+
+def forbidden_pairs(
+    pairs: Iterable[tuple[int, int, int]], different: Iterable[tuple[int, int, int]] = (), listed: int | None = None
+) -> str:
+    """The rule that these pairs of visits are not all the same while those are not; only while answers up to a batch are listed, if given."""
+    body = [*(f"same({i},{j},{r})" for i, j, r in pairs), *(f"not same({i},{j},{r})" for i, j, r in different)]
+    return f":- {', '.join(body if listed is None else [f'listed({listed})', *body])}."
+
+
+_number = cache(Number)  # half the time of a symbol, where there are many
+
+
+def numbers(*arguments: int) -> list[Symbol]:
+    """Numbers as the arguments of a program part, or of an atom."""
+    return [_number(argument) for argument in arguments]
+
+
+def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
+    """The map of the causal level that these labels of the first steps make, dstates numbered by first visit."""
+    number: dict[int, int] = {}
+    first: list[int] = []
+    for t, label in enumerate(labels):
+        if number.setdefault(label, len(number)) == len(first):
+            first.append(t)
+    found = tuple(number[label] for label in labels)
+    return SSHMap(found, tuple(DState(i, _view(trace, t)) for i, t in enumerate(first)), links_of(found, trace))
+
+
+def street_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
+    """What happened at the nodes of a chart, as facts for streets.lp."""
+    facts = [f"turned({s},{x},{-action})." for s, action, x in chart.links if action < 0]
+    facts += [f"travel({s},{x})." for s, _, x in chart.travels]
+    facts += [f"around({s},{x})." if turn == "around" else f"bend({s},{turn},{x})." for s, turn, x in chart.turns(trace)]
+    return "\n".join([*facts, side_facts(theory)])
+
+
+def side_facts(theory: Theory) -> str:
+    """Which axioms of the sides of paths hold in a theory, as facts."""
+    facts = ["sided."] if theory.boundary != "none" else []
+    facts += ["symmetric."] if theory.symmetric_sides else []
+    return "\n".join(facts)
+
+
+def way_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
+    """Which numbered actions are travels and turns, and which axioms of sides hold, as facts for ways.lp."""
+    kinds = [f"turns({a},{action.turn})." if action.turn else f"travels({a})." for a, action in actions.items()]
+    return "\n".join([*kinds, side_facts(theory)])
+
+
+def course_facts(
+    theory: Theory, dstates: Iterable[int], links: Iterable[tuple[int, int, int]], actions: Mapping[int, Action], *, single: bool = False
+) -> str:
+    """Dstates, the numbered actions that link them, and what is preferred, as facts for courses.lp; or for single courses."""
+    facts = [side_facts(theory), *(["total."] if theory.path_order == "total" else []), *(["single."] if single else [])]
+    facts += [f"is({x})." for x in dstates]
+    facts += [f"turn({s},{turn},{x})." if (turn := actions[a].turn) else f"travel({s},{x})." for s, a, x in links]
+    return "\n".join([*facts, *_preferred(theory)])
+
+
+def turn_facts(batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]) -> str:
+    """New visits, and new turns on a visit, from slot to slot, as facts for sides.lp."""
+    facts = [f"visit({batch},{visit})." for visit in visits]
+    for s, turn, x in turns:
+        (visit, slot), (_, faced) = chart.facing[s], chart.facing[x]
+        facts.append(f"{'about' if turn == 'around' else 'turns'}({batch},{visit},{slot},{faced}).")
+    return "\n".join(facts)
+
+
+def read_contrary(model: Model) -> tuple[list[int], list[int]]:
+    """Dstates whose streets show that they have none, shortest streets first; and dstates where streets cross that meet again."""
+    atoms = list(map(_atom, model.symbols(shown=True)))
+    contrary = sorted((args[1], args[0]) for name, args in atoms if name == "contrary")
+    return [dstate for _, dstate in contrary], sorted(args[0] for name, args in atoms if name == "twice")
+
+
+def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int], *, single: bool = False) -> str:
+    """The dstates of these nodes, what is open from dstates, and what is preferred, as facts for the least streets; or for single ones."""
+    facts = [settled_labels((node, labels[node]) for node in nodes), *(["single."] if single else [])]
+    for label, node in {label: node for node, label in enumerate(labels)}.items():  # any node of a dstate sees the same star
+        visit, slot = chart.facing[node]
+        star = chart.stars[visit]
+        facts += [f"open({label},{k})." for k in range(4) if star[(slot + k) % 4]]
+    return "\n".join([*facts, *_preferred(theory)])
+
+
+def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
+    """The stretches of streets.lp, and pairs of them that cannot be one path, in neither direction."""
+    stretches = sorted(_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("stretch", 1))
+    rivals = {tuple(_atom(atom.symbol)[1]) for atom in control.symbolic_atoms.by_signature("rival", 3)}
+    return stretches, [(g, h) for g, h, direction in rivals if direction == 1 and (g, h, -1) in rivals]
+
+
+def pinned_facts(stretches: Iterable[int]) -> str:
+    """Stretches no two of which can be one path, as facts for streets.lp."""
+    return " ".join(f"pinned({stretch})." for stretch in stretches)
+
+
+def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int, int]]]:
+    """Whether the labels of nodes are violated, and else which pairs of dstates are at different places, and which are one."""
+    found: dict[str, list[tuple[int, int]]] = {"elsewhere": [], "one": []}
+    for name, args in map(_atom, model.symbols(shown=True)):
+        if name == "violated":
+            return True, [], []
+        found[name].append((args[0], args[1]))
+    return False, found["elsewhere"], found["one"]
+
+
+def is_violated(control: Control) -> bool:
+    """Whether no streets fit the labels of nodes, where that takes no choice to see."""
+    return control.symbolic_atoms[Function("violated")] is not None
+
+
+def loose(labels: Iterable[int]) -> str:
+    """Dstates that may turn out to be others, as facts."""
+    return "\n".join(f"loose({label})." for label in labels)
+
+
+def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
+    """Nodes and their dstates, as facts."""
+    return "\n".join(f"is({node},{label})." for node, label in labels)
+
+
+def open_labels(labels: Sequence[int]) -> str:
+    """The dstate of each node, for clingo to take or leave, as long as something is violated."""
+    return "\n".join([*(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)), ":- not violated.", "#show is/2."])
+
+
+def read_contraries(model: Model) -> list[int]:
+    """Dstates whose paths show that there are no places and paths for them."""
+    return sorted(args[0] for name, args in map(_atom, model.symbols(shown=True)) if name == "contrary")
+
+
+def forbidden_links(links: Iterable[tuple[int, int, int]]) -> str:
+    """The rule that these links of named dstates do not go together."""
+    return f":- {', '.join(f'goes({s},{a},{x})' for s, a, x in links)}."
+
+
+@dataclass(frozen=True, slots=True)
+class StreetAnswer:
+    """An answer of streets.lp or courses.lp.
+
+    at     of each place that the turns tell, the place that it is at, and how it is turned to it
+    part   of each stretch, the path that it is part of, and in which direction
+    order  of each path, its places
+    """
+
+    at: dict[int, tuple[int, int]]
+    part: dict[int, tuple[int, int]]
+    order: dict[int, list[int]]
+
+
+class StreetReader:
+    """Reads the maps of one labelling of nodes from answers of streets.lp or courses.lp; what the labels alone tell is worked out once.
+
+    An answer is asked for atoms that it may hold, those of the last one first: that takes a third of the time that it takes to read all it holds.
+    """
+
+    def __init__(self, control: Control, trace: Trace, theory: Theory, chart: Chart, labels: Sequence[int]) -> None:
+        stands, runs = ({a: (b, c) for a, b, c in _literals(control, name)} for name in ("stands", "runs"))
+        first: dict[int, int] = {}  # step at a dstate, by its label
+        for t, node in enumerate(chart.node_of):
+            first.setdefault(labels[node], t)
+        number = {label: i for i, label in enumerate(first)}
+        self._labels = tuple(number[labels[node]] for node in chart.node_of)
+        self._links = links_of(self._labels, trace)
+        self._dstates = [(_view(trace, t), *stands[label]) for label, t in first.items()]
+        self._runs: dict[int, list[tuple[int, int]]] = {}  # of each stretch, the dstates on it, and whether they face its direction
+        for i, label in enumerate(first):
+            if label in runs:
+                stretch, direction = runs[label]
+                self._runs.setdefault(stretch, []).append((i, direction))
+        self._passes = {(stretch, self._dstates[i][1]): None for stretch, members in self._runs.items() for i, _ in members}
+        self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
+        self._total = theory.path_order == "total"
+        self._before: dict[_Ahead, int] = {}  # literals, 0 for what is never so
+        self._order: dict[int, list[int]] = {}  # of each path, its places when they were last asked for
+        self._placed: _Placed | None = None  # of the last map: places are mostly as in that
+        self._made: dict[tuple[object, ...], DState] = {}  # most dstates are the same in most maps
+
+    def read(self, model: Model) -> StreetAnswer:
+        """What an answer holds."""
+        at, part = self._at.made_in(model), self._part.made_in(model)
+        on: dict[int, dict[int, None]] = {}  # of each path, the places on it
+        for stretch, component in self._passes:
+            on.setdefault(part[stretch][0], {})[at[component][0]] = None
+        return StreetAnswer(at, part, {path: self._ordered(model, path, places) for path, places in on.items()})
+
+    def _ordered(self, model: Model, path: int, places: Collection[int]) -> list[int]:
+        """The places of a path in order: mostly near that of the last answer."""
+        order = list(dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places]))
+        if self._total:
+            for i, place in enumerate(order):  # by insertion
+                to = i
+                while to and not self._is_before(model, (path, order[to - 1], place)):
+                    to -= 1
+                order.insert(to, order.pop(i))
+        else:
+            order = _in_order(places, (pair for pair in permutations(places, 2) if self._is_before(model, (path, *pair))))
+        self._order[path] = order
+        return order
+
+    def _is_before(self, model: Model, ahead: _Ahead) -> bool:
+        literal = self._before.get(ahead)
+        if literal is None:
+            atom = model.context.symbolic_atoms[Function("before", numbers(*ahead))]
+            literal = self._before[ahead] = atom.literal if atom else 0
+        return literal != 0 and model.is_true(literal)
+
+    def map_of(self, answer: StreetAnswer) -> SSHMap:
+        """The map that it describes."""
+        placed = self._placed
+        if placed is None or placed.at != answer.at:
+            placed = self._placed = self._placed_at(answer.at)
+        faced: dict[int, tuple[int, int]] = {}  # of each path, its number and the direction that is faced first
+        dstates = list(placed.dstates)
+        for stretch, members in self._runs.items():
+            h, ahead = answer.part[stretch]
+            path, first = faced.setdefault(h, (len(faced), ahead * members[0][1]))
+            key = stretch, path, ahead * first
+            along = placed.along.get(key)
+            if along is None:
+                along = placed.along[key] = [(i, self._dstate(dstates[i], path, key[2] * direction)) for i, direction in members]
+            for i, dstate in along:
+                dstates[i] = dstate
+        orders = ((path, [placed.number[p] for p in answer.order[h][::first]]) for h, (path, first) in faced.items())
+        paths = tuple(Path(path, tuple(order)) for path, order in orders)
+        return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(placed.number))), paths)
+
+    def _placed_at(self, at: dict[int, tuple[int, int]]) -> _Placed:
+        """What places tell."""
+        arrived: dict[int, tuple[int, int]] = {}  # of each place, its number and the slot that is faced first
+        dstates: list[DState] = []
+        for view, component, slot in self._dstates:
+            p, turned = at[component]
+            place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
+            dstates.append(DState(len(dstates), view, place, heading=(slot + turned - facing) % 4))
+        return _Placed(at, {p: number for p, (number, _) in arrived.items()}, dstates, {})
+
+    def _dstate(self, placed: DState, path: int, direction: int) -> DState:
+        """A dstate on a path."""
+        key = placed.id, placed.place, placed.heading, path, direction
+        if key not in self._made:
+            self._made[key] = replace(placed, path=path, direction=direction)
+        return self._made[key]
+
+
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """What the places of an answer tell of a map.
+
+    at       as in StreetAnswer
+    number   of each place
+    dstates  without paths
+    along    those on a stretch, by the stretch, the path that it is part of, and in which direction
+    """
+
+    at: dict[int, tuple[int, int]]
+    number: dict[int, int]
+    dstates: list[DState]
+    along: dict[tuple[int, int, int], list[tuple[int, DState]]]
+
+
+class _Choices:
+    """The atoms of which an answer holds one for each first argument."""
+
+    def __init__(self, control: Control, name: str) -> None:
+        self._among: dict[int, list[tuple[int, tuple[int, int]]]] = {}  # literals, and what they say
+        for (a, b, c), literal in _literals(control, name).items():
+            self._among.setdefault(a, []).append((literal, (b, c)))
+
+    def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
+        """What an answer says of each first argument."""
+        made = {}
+        for a, among in self._among.items():
+            if len(among) > 1 and not model.is_true(among[0][0]):
+                taken = next(i for i, (literal, _) in enumerate(among) if model.is_true(literal))
+                among.insert(0, among.pop(taken))
+            made[a] = among[0][1]
+        return made
+
+
+def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
+    """The literals of atoms with three arguments, by these."""
+    found = {}
+    for atom in control.symbolic_atoms.by_signature(name, 3):
+        a, b, c = _atom(atom.symbol)[1]
+        found[a, b, c] = atom.literal
+    return found
+
+
+def links_of(labels: Sequence[int], trace: Trace) -> tuple[tuple[int, str, int], ...]:
+    """The distinct links that a labelling of the trace's first steps makes, sorted."""
+    return tuple(sorted({(s, action.name, x) for (s, x), action in zip(pairwise(labels), trace.actions, strict=False)}))
+
+
+def _view(trace: Trace, step: int) -> str | int:
+    view = trace.steps[step].view
+    assert view is not None
+    return view
+
+
+def _paths(count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]) -> tuple[Path, ...]:
+    """Paths with their places in order."""
+    on: list[set[int]] = [set() for _ in range(count)]
+    for s in dstates:
+        if s.path is not None and s.place is not None:
+            on[s.path].add(s.place)
+    pairs: list[list[tuple[int, int]]] = [[] for _ in range(count)]
+    for path, p, q in before:
+        if p in on[path] and q in on[path]:
+            pairs[path].append((p, q))
+    return tuple(Path(path, tuple(_in_order(found, pairs[path]))) for path, found in enumerate(on))
+
+
+def _in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:
+    """Places, each behind the ones that are before it: in a strict order it has more of those than they have."""
+    behind = dict.fromkeys(places, 0)
+    for _, q in before:
+        behind[q] += 1
+    return sorted(behind, key=lambda p: (behind[p], p))

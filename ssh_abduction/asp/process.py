@@ -1,0 +1,90 @@
+"""Work in a process of its own, which has a processor to itself: of the threads of one process but one runs Python at a time, and but one grounds."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TypeVar
+
+from ssh_abduction.asp.asking import POLL, Stopped, Watch
+
+Result = TypeVar("Result")
+
+_SERVE = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from ssh_abduction.asp.process import serve; serve()"
+
+
+def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) -> Result:
+    """What `work` makes of these arguments, and of a watch, which comes last. It is done here, if there can be no other process.
+
+    work, arguments  picklable; so are the result, and what work raises
+    watch            may end the process. What it leaves of the memory limit is that of the other one
+
+    Raises Stopped, also where something from outside ends the process.
+    """
+    code, answer = _run(work, arguments, watch)
+    if code == 0:
+        answered: tuple[Result, Exception | None] = pickle.loads(answer)
+        result, error = answered
+        if error is not None:
+            raise error
+        return result
+    if code < 0:
+        raise Stopped("memory limit")  # else nobody ends it
+    return work(*arguments, watch)
+
+
+def _run(work: Callable[..., object], arguments: tuple[object, ...], watch: Watch) -> tuple[int, bytes]:
+    """The exit code of a process, and what it wrote. It ends as its input does, should this process end first."""
+    if "python" not in os.path.basename(sys.executable or "").lower():  # a program that has Python inside
+        return 1, b""
+    with (
+        suppress(OSError),
+        tempfile.TemporaryFile() as answer,
+        subprocess.Popen([sys.executable, "-c", _SERVE], stdin=subprocess.PIPE, stdout=answer, stderr=subprocess.DEVNULL) as process,
+    ):
+        assert process.stdin
+        try:
+            with suppress(BrokenPipeError):
+                for sent in (sys.path, (work, arguments, watch.memory_left())):
+                    pickle.dump(sent, process.stdin)
+                process.stdin.flush()
+            while process.poll() is None:
+                watch.check()
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(POLL)
+        finally:
+            process.kill()
+        answer.seek(0)
+        return process.returncode, answer.read()
+    return 1, b""
+
+
+def serve() -> None:
+    """Do the work that comes in, and write its result, or what it raised, to the output."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is meant for the process that waits for this one
+    work, arguments, memory = pickle.load(sys.stdin.buffer)
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    watch = Watch(memory=memory)
+    with os.fdopen(os.dup(1), "wb") as output:
+        os.dup2(2, 1)  # nothing else is written there
+        try:
+            answer: tuple[object, Exception | None] = work(*arguments, watch), None
+        except Exception as error:
+            answer = None, error
+        output.seek(0)
+        output.truncate()  # something may have greeted there as Python began
+        pickle.dump(answer, output)
+    os._exit(0)
+
+
+def _end_with_input() -> None:
+    while os.read(0, 1):
+        pass
+    os._exit(1)

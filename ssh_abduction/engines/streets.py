@@ -1,0 +1,207 @@
+"""Questions to streets.lp: what order and sides say of the dstates of a trace whose places have frames, and which guesses they let be maps.
+
+What takes a choice of places and paths is asked by an engine, under its limits (`framed.py`). What is asked here takes none, or hardly any: so little
+time that some conflicts are limit enough.
+
+*A guess.* Visits are annealed (`annealing.py`). Where the guess cannot be right its places are let free, and what is there is merged by evidence
+(`merging.py`), while streets.lp says which visits cannot be one, and which have to be, and which merge leads to no streets: so a guess becomes a map.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import clingo
+import numpy as np
+
+from ssh_abduction.asp import facts
+from ssh_abduction.asp.asking import Control, Watch
+from ssh_abduction.guesses.annealing import MORE, SECONDS, attempts
+from ssh_abduction.guesses.merging import Told, first_failing, kept, merged_as_told, merged_near
+from ssh_abduction.steps.apart import Matrix, large_clique
+from ssh_abduction.steps.chart import FramedChart
+from ssh_abduction.steps.localising import faced, states_of, tracked
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Trace
+
+FIRST_PAIRS = 200_000  # visits that may be one, of the beginning that is guessed first, where a trace has more than twice as many
+LOST = 0.05  # of all visits, at most, if the beginning says where they are
+TRYING = 500  # conflicts after which it is left open whether there are single streets
+LEFT_OUT = 3  # places, at most, without which a guess has streets
+LOOSENED = 2  # so many travels, less one, from where a guess cannot be right its places are let free
+
+
+class Streets:
+    """The axioms of places and paths, for charts of one trace.
+
+    pinned  whether stretches no two of which can be one path are named as paths beforehand
+    """
+
+    def __init__(self, trace: Trace, theory: Theory, *, pinned: bool = True) -> None:
+        self._trace = trace
+        self._theory = theory
+        self._pinned = pinned
+
+    def control(self, chart: FramedChart, options: Sequence[str] = ()) -> clingo.Control:
+        """A control with these axioms, and what happened; nothing is grounded yet."""
+        control = Control(options)
+        control.load(encodings.path("streets"))
+        control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
+        return control
+
+    def settled(
+        self, chart: FramedChart, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None, *, single: bool
+    ) -> clingo.Control:
+        """A control for the streets that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
+        control = self.control(chart, options)
+        control.load(encodings.path("preference"))
+        nodes = range(len(labels)) if nodes is None else nodes
+        control.add("base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single))
+        control.ground([("base", []), *([("again", [])] if single else []), ("least", [])])
+        if self._pinned and not single:
+            control.add("pinned", [], facts.pinned_facts(_rivals(*facts.read_rivals(control))))
+        control.ground([("pinned", []), ("paths", [])])
+        return control
+
+    def telling(self, chart: FramedChart, labels: Sequence[int], loose: Iterable[int]) -> clingo.Control:
+        """A control for what holds wherever the nodes are at these dstates, though loose ones may turn out to be others."""
+        control = self.control(chart)
+        control.add("base", [], f"{facts.settled_labels(enumerate(labels))}\n{facts.loose(loose)}")
+        control.ground([("base", []), ("again", []), ("apart", [])])
+        return control
+
+    def told(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
+        """Which nodes are apart, and which are one, where these labels hold of all nodes but some; None where that cannot be."""
+        control = self.telling(chart, labels, {labels[node] for node in loose})
+        with control.solve(yield_=True) as handle:
+            model = handle.model()
+            assert model
+            violated, elsewhere, one = facts.read_told(model)
+        if violated:
+            return None
+        first = {label: node for node, label in reversed(list(enumerate(labels)))}
+        return _apart(chart, labels, elsewhere), [(first[a], first[b]) for a, b in one]
+
+    def may_fit(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
+        """Whether these labels, which hold of all nodes but some, may be those of a map, as far as single streets tell."""
+        control = self.control(chart)
+        control.add("base", [], facts.settled_labels(enumerate(labels)))
+        control.ground([("base", [])])
+        return not facts.is_violated(control) and self._may_have_single(chart, labels, loose)
+
+    def has_single(self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None) -> bool | None:
+        """Whether the labels of all nodes, or of these, have streets, as far as single ones tell. None where that is not soon known."""
+        options = [f"--solve-limit={TRYING}"]
+        return self.settled(chart, labels, options, nodes, single=True).solve().satisfiable
+
+    def _may_have_single(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
+        return self.has_single(chart, labels, set(range(len(labels))).difference(loose)) is not False
+
+    def guessed_labels(self, chart: FramedChart, watch: Watch) -> list[int]:
+        """Labels of a map of the causal axioms: one that has streets, as far as single ones tell, or where that is not soon found one of few dstates.
+
+        Of a long trace the beginning is guessed, and the rest as that says; where that is no map, twice as many visits, and so on.
+        """
+        visits = chart.visits_with(FIRST_PAIRS)
+        while visits < len(chart.stars) and chart.fitting[-1] > 2 * chart.fitting[visits]:
+            part = chart.beginning(visits)
+            if labels := self._continued(chart, part, self._guessed(part, watch.check), watch.check):
+                return labels
+            visits *= 2
+        return self._guessed(chart, watch.check)
+
+    def _guessed(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
+        """The same, of visits that are guessed in one go."""
+        began = time.thread_time()  # a thread may be made to wait
+        apart = chart.apart()
+        found: list[list[int]] = []
+        for _, guess in attempts(replace(chart, elsewhere=()), check):
+            starts = [guess.loosened(chart, travels).labels(chart) for travels in range(LOOSENED)]
+            maps = [(merged_near(apart, chart.links, start, check), start) for start in starts]
+            ranked = sorted(maps, key=lambda pair: len(set(pair[0])))
+            for _, start in ranked:
+                if labels := self.labels_near(chart, apart, start, check):
+                    return labels
+            found.append(ranked[0][0])
+            if len(found) >= len(MORE) and time.thread_time() - began > SECONDS:
+                return min(found, key=lambda labels: len(set(labels)))
+        raise AssertionError
+
+    def _continued(self, chart: FramedChart, part: FramedChart, known: Sequence[int], check: Callable[[], None]) -> list[int] | None:
+        """Such labels of all visits near those of a beginning, if these say where most visits are."""
+        states = tracked(chart, dict(enumerate(states_of(part, known))))
+        if states.count(-1) > LOST * len(states):
+            return None
+        start = [faced(states[visit], slot) if states[visit] >= 0 else -1 for visit, slot in chart.facing]
+        return self.labels_near(chart, chart.apart(), start, check)
+
+    def labels_near(
+        self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None] = lambda: None
+    ) -> list[int] | None:
+        """Labels near these, which are -1 where they are not known, of a map that has streets, as far as single ones tell; None if none is soon found.
+
+        apart  which nodes are apart, nodes x nodes
+        check  called now and then; may raise
+        """
+        tell = partial(self._told_if_single, chart)
+        likely = self._likely(chart, apart, start, check)
+        labels = merged_as_told(apart, chart.links, likely, tell, partial(self.may_fit, chart), check) if likely else None
+        return labels if labels and self.has_single(chart, labels) else None
+
+    def _told_if_single(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
+        """As `told`; None where the others have no streets either, as far as single ones tell."""
+        told = self.told(chart, labels, loose)
+        return told if told and self._may_have_single(chart, labels, loose) else None
+
+    def _likely(self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]) -> list[int] | None:
+        """A guess without those of its places with which it has no streets, if they are few: -1 there."""
+        states = states_of(chart, kept(apart, chart.links, start))
+        visits = Counter(state // 4 for state in states)
+        # What was visited once cannot be wrong by itself, and hardly what was visited often.
+        places = sorted(visits, key=lambda place: (visits[place] > 1, -visits[place]))
+        left_out: set[int] = set()
+
+        def of_first(number: int) -> list[int]:
+            some = set(places[:number]) - left_out
+            return [label if states[visit] // 4 in some else -1 for label, (visit, _) in zip(start, chart.facing, strict=True)]
+
+        def agrees(number: int) -> bool:
+            check()
+            labels = of_first(number)
+            loose = [node for node, label in enumerate(labels) if label < 0]
+            return self.may_fit(chart, kept(apart, chart.links, labels), loose)
+
+        right = 0
+        while not agrees(len(places)):
+            if right == len(places) or len(left_out) == LEFT_OUT:
+                return None
+            right = first_failing(agrees, right + 1, len(places))
+            left_out.add(places[right - 1])
+        return of_first(len(places))
+
+
+def _rivals(stretches: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
+    """As many stretches as are soon found no two of which can be one path, as these pairs cannot."""
+    number = {stretch: i for i, stretch in enumerate(stretches)}
+    rivals = np.zeros((len(stretches), len(stretches)), dtype=bool)
+    for g, h in pairs:
+        rivals[number[g], number[h]] = True
+    return [stretches[i] for i in large_clique(rivals)]
+
+
+def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:
+    """Nodes x nodes: they are of visits some nodes of which have labels that are at different places."""
+    pairs = np.array(list(elsewhere), dtype=int).reshape(-1, 2)
+    different = np.zeros((max(labels) + 1,) * 2, dtype=bool)
+    different[pairs[:, 0], pairs[:, 1]] = different[pairs[:, 1], pairs[:, 0]] = True
+    visits = np.array([visit for visit, _ in chart.facing])  # in order, as nodes are numbered by the first step at them
+    starts = np.flatnonzero(np.diff(visits, prepend=-1))
+    rows = np.logical_or.reduceat(different[list(labels)], starts, axis=0)
+    apart = np.logical_or.reduceat(rows[:, list(labels)], starts, axis=1)
+    nodes: Matrix = apart[np.ix_(visits, visits)]
+    return nodes

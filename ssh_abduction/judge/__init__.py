@@ -1,0 +1,1 @@
+"""The judges of maps and bounds: plain Python that shares nothing with the encodings, so that it can catch them."""

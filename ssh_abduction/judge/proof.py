@@ -1,0 +1,68 @@
+"""Checks the proof that no map of a trace has fewer dstates, in plain Python that shares nothing with the solver.
+
+>>> from ssh_abduction import Trace
+>>> from ssh_abduction.judge.proof import check_bound
+>>> trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
+>>> check_bound(trace, {"clique": [0, 1, 2, 3], "words": [[0, 2, ["travel"]]], "refuted": []})
+ProvenBound(dstates=4, refuted=(), faults=())
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+from ssh_abduction.errors import MapError, brief
+from ssh_abduction.trace import Trace
+
+
+@dataclass(frozen=True, slots=True)
+class ProvenBound:
+    """What a certificate proves: so many dstates at least, and what is wrong with it. `refuted` is clingo's word, which is not checked here."""
+
+    dstates: int
+    refuted: tuple[int, ...]
+    faults: tuple[str, ...]
+
+
+def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
+    """Check the certificate of a lower bound on dstates, as `Certificate.to_dict` wrote it.
+
+    Steps that the same actions lead to different views from are different dstates, as a dstate has one view and actions are
+    deterministic. So each pair of the clique is followed along the trace. Raises MapError where the certificate is malformed.
+    """
+    if not isinstance(certificate, Mapping):
+        raise MapError(f"certificate: expected an object, got {brief(certificate)}; solve the trace again with --json")
+    if "clique" not in certificate:
+        raise MapError("certificate: clique: expected one, got none; solve the trace again with --json")
+    steps, words, refuted = (certificate.get(name, []) for name in ("clique", "words", "refuted"))
+    if not _integers(steps) or not all(0 <= step < len(trace) for step in steps) or len(set(steps)) < len(steps):
+        raise MapError(f"certificate: clique: expected different steps, 0 to {len(trace) - 1}, got {brief(steps)}")
+    if not _integers(refuted) or refuted != list(range(len(steps), len(steps) + len(refuted))):
+        raise MapError(f"certificate: refuted: expected the numbers from {len(steps)} up without a gap, got {brief(refuted)}")
+    word_of: dict[frozenset[int], list[str]] = {}
+    for entry in words if isinstance(words, list) else [words]:
+        if not isinstance(entry, list) or len(entry) != 3 or not _integers(entry[:2]) or not isinstance(entry[2], list):
+            raise MapError(f"certificate: words: expected [step, step, [action, …]], got {brief(entry)}")
+        word_of[frozenset(entry[:2])] = entry[2]
+    pairs = list(combinations(steps, 2))
+    faults = [fault for i, j in pairs if (fault := _not_apart(trace, i, j, word_of.get(frozenset((i, j)), [])))]
+    return ProvenBound(len(steps), tuple(refuted), tuple(faults))
+
+
+def _integers(values: Any) -> bool:
+    return isinstance(values, list) and all(isinstance(value, int) and not isinstance(value, bool) for value in values)
+
+
+def _not_apart(trace: Trace, i: int, j: int, word: Sequence[str]) -> str | None:
+    """Why these actions do not show that the steps are different dstates, if so."""
+    for k, name in enumerate(word):
+        for step in (i + k, j + k):
+            action = trace.steps[step].action if step < len(trace) else None
+            if action is None or action.name != name:
+                return f"steps {i} and {j}: {brief(name)} is not what was done at step {step}"
+    if trace.steps[i + len(word)].view == trace.steps[j + len(word)].view:
+        return f"steps {i} and {j}: {' '.join(word) or 'nothing done'} leads to the same view from both"
+    return None

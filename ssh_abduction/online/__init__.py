@@ -1,0 +1,1 @@
+"""The minimal maps of a trace that grows."""

@@ -1,0 +1,81 @@
+"""Maps of a trace that a robot is still driving: made of guesses, or mended, in no time or in a process of their own. For theories where places have frames.
+
+Consistent by the axioms of the theory (`framed.py`), but not minimal for sure.
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Sequence
+from concurrent.futures import Future
+
+from ssh_abduction.asp.asking import Stopped, Watch, has_processors
+from ssh_abduction.asp.process import in_process
+from ssh_abduction.engines.framed import FramedEngine
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.steps.log import Log
+from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Step, Trace
+
+
+def guessed_map(trace: Trace, theory: Theory, speedups: Speedups, watch: Watch) -> SSHMap | None:
+    """A map made of a guess, if one is found soon."""
+    found = FramedEngine(trace, theory, watch, Log(trace, theory), speedups).map_of_guess()
+    return found.map if found else None
+
+
+def mended_map(trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None) -> SSHMap | None:
+    """A map of a trace near one of its first steps that its later steps contradict, if there is one in which all that does not fit is new."""
+    watch = watch or Watch()
+    found = FramedEngine(trace, theory, watch, Log(trace, theory), speedups).map_mended_from(known.labels)
+    return found.map if found else None
+
+
+class MapGuess:
+    """A map of a trace that grows, made in a process of its own. That ends when this is no longer referred to, and with the program.
+
+    A map is made of a guess, unless one is known. As the trace has grown meanwhile, and may contradict it, it is mended at the end.
+
+    steps  those of the trace so far; more may be appended
+    """
+
+    def __init__(self, steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None = None) -> None:
+        self._found: Future[SSHMap | None] = Future()
+        watch = Watch()
+        thread = threading.Thread(target=_make, args=(steps, theory, speedups, known, watch, self._found), daemon=True)
+        weakref.finalize(self, _end, watch, thread)
+        thread.start()
+
+    @staticmethod
+    def begun(steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None = None) -> MapGuess | None:
+        """None where there is no second processor, or guesses are not wanted."""
+        wanted = speedups.annealed and speedups.processes and has_processors(speedups)
+        return MapGuess(steps, theory, speedups, known) if wanted else None
+
+    def done(self) -> bool:
+        return self._found.done()
+
+    def map(self) -> SSHMap | None:
+        """The map of the first steps, if one was found. Waits until that is known."""
+        return self._found.result()
+
+
+def _make(
+    steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None, watch: Watch, found: Future[SSHMap | None]
+) -> None:
+    try:
+        known = known or in_process(guessed_map, Trace(tuple(steps)), theory, speedups, watch=watch)
+        if known and len(steps) > len(known.labels):
+            known = in_process(mended_map, Trace(tuple(steps)), theory, known, speedups, watch=watch)
+        found.set_result(known)
+    except Stopped:
+        found.set_result(None)
+    except BaseException as error:
+        found.set_exception(error)
+
+
+def _end(watch: Watch, thread: threading.Thread) -> None:
+    watch.interrupted = True
+    thread.join()

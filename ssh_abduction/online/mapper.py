@@ -1,0 +1,314 @@
+"""The minimal maps of a trace that grows, kept current step by step while the robot drives.
+
+>>> from ssh_abduction import OnlineMapper, Theory
+>>> mapper = OnlineMapper("end", Theory.topological())
+>>> for action, view in [("travel", "hall"), ("travel", "end"), ("around", "end"), ("travel", "hall")]:
+...     solution = mapper.observe(action, view)
+>>> solution.status.value, solution.count, solution.cost.dstates, solution.complete
+('optimal', 2, 5, True)
+
+Most steps are replayed, without asking clingo
+----------------------------------------------
+Let M be all minimal maps of the steps so far, of cost c. A new step is PREDICTED by a map that knows the action in the dstate that the
+robot is in, and shows there what is seen; CONTRADICTED, if it shows something else; UNKNOWN, if the action was never tried there.
+
+*Claim.* If some map of M predicts the step and none finds it unknown, the ones that predict it are all minimal maps of the longer trace.
+
+*Proof.* By (1) of the claim in `solver.py`, no map of the longer trace costs less than c. A map that predicts the step costs c, by (2).
+Conversely let F be a minimal map of the longer trace. It costs c, and, cut by the last step, is a map R of M, by (3). R does not
+contradict the step: actions are deterministic, and a dstate has one observation, by functional_view and the axioms of the stars
+(`replay.observation` takes the star as these read it, so another rotation of a pattern is no contradiction). So R predicts the
+step, and F is the replayed R, by (3). ∎
+
+Else clingo is asked, in the one control that is kept: for all maps of cost c if some map of M predicts the step, else for the minimum,
+which is at least what was proved before. A theory `without` axioms is solved anew, as the claim does not hold.
+
+When time is short
+------------------
+A map that predicts the step is minimal even if there is no time to look for others. Once there is none, the answer is feasible: the last
+bound, which holds for the longer trace by (1), and a map. That is a map of fewer steps that goes on like a sketch (`sketch.py`), and that the
+checker finds consistent; or a sketch of all steps. Where places have frames, a map that is contradicted is mended: what does not fit is
+something new. clingo is asked again when the trace is longer by RETRY and PAUSE; it goes on where it was stopped, and may prove a map minimal
+again.
+
+Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`guessing.py`), one after another, in a process
+of their own, and mended there where that takes longer than a step may.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from ssh_abduction.engines.base import AT_ONCE, Cost
+from ssh_abduction.errors import TraceError, brief
+from ssh_abduction.guesses.continuing import Sketch
+from ssh_abduction.judge.checker import check
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver.search import ALL, Search, Seconds, Solution, Status
+from ssh_abduction.steps.log import Outcome, observation
+from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Action, Step, Trace, View
+
+if TYPE_CHECKING:
+    from ssh_abduction.online.background import MapGuess
+
+RETRY = 1.01  # after a search that was stopped, the trace grows by this factor before the next, so that few steps are slow,
+PAUSE = 2  # and by so many steps at least
+DRAFTS = 3  # maps of fewer steps that go on like sketches, at most
+GUESSED = 100  # steps from which on maps are guessed
+MENDING = 5e-7  # seconds that it takes to mend a map, about, by the square of the number of steps
+GUESS_AGAIN = 1.05  # the trace grows by this factor before the next guess
+
+
+class OnlineMapper:
+    """Keeps the minimal maps current while a robot drives. `solution` is the answer for the steps so far.
+
+    view     what is seen at first
+    theory   which axioms and which preference; Theory.topological() by default. The first step settles star=auto
+    star     the openings seen at first, as in Step, if the theory uses stars
+    limit    seconds that a step may take, about: clingo cannot be stopped while it grounds a step. None waits for the exact answer
+    maps     keep at most so many maps; 0 keeps all
+    speedups  what makes solving fast, as for Search
+    """
+
+    def __init__(
+        self,
+        view: View,
+        theory: Theory | None = None,
+        *,
+        star: Sequence[float] | None = None,
+        limit: float | None = 0.5,
+        maps: int = 100,
+        speedups: Speedups = ALL,
+    ) -> None:
+        first = Step.of(view, star, "step 0")
+        theory = theory or Theory.topological()
+        self.theory = theory.resolve(Trace((first,)))
+        if theory.level == "causal":  # now rather than at the step that first needs it, as it takes its time
+            importlib.import_module("ssh_abduction.engines.causal")
+        elif self.theory.has_frames:
+            importlib.import_module("ssh_abduction.online.background")
+        began = time.perf_counter()
+        self.searches = 0  # how often clingo was asked
+        self._without_stars = theory.star == "auto" and self.theory.star == "none"
+        self._limit, self._most, self._speedups = limit, maps, speedups
+        self._steps = [first]
+        self._seen = [observation(first, self.theory)]
+        self._actions: dict[str, Action] = {}
+        self._status = Status.UNKNOWN
+        self._complete = False
+        self._cost: Cost | None = None
+        self._maps: list[_Replayed] = []
+        self._drafts: list[Sketch] = []  # beyond maps of fewer steps, the best first
+        self._sketches = Sketch.all_of(first, self.theory)
+        self._guess: MapGuess | None = None
+        self._next_guess = GUESSED  # not before the trace has so many steps
+        self._mending = MENDING  # seconds, by the square of the number of steps
+        self._search: Search | None = None
+        self._asked: Solution | None = None  # what it said
+        self._next_search = 0  # not before the trace has so many steps
+        self._ask()
+        self.solution = self._answer(began)
+
+    def __repr__(self) -> str:
+        cost = self.solution.cost
+        return f"<OnlineMapper: {len(self._steps)} steps, {self.solution.status.value}, {cost.dstates if cost else 'no'} dstates>"
+
+    @property
+    def trace(self) -> Trace:
+        """The steps so far."""
+        return Trace(tuple(self._steps))
+
+    def observe(self, action: Action | str | Mapping[str, Any], view: View, *, star: Sequence[float] | None = None) -> Solution:
+        """Take in an action and what was seen then, and say what the minimal maps are now.
+
+        Raises TraceError where the step does not fit theory and trace; the mapper stays as it was.
+        """
+        began = time.perf_counter()
+        self._take(Action.of(action), view, star, began)
+        self.solution = self._answer(began)
+        return self.solution
+
+    def _take(self, action: Action, view: View, star: Sequence[float] | None, began: float) -> None:
+        """Take in a step."""
+        step = Step.of(view, star, f"step {len(self._steps)}")
+        last = replace(self._steps[-1], action=action)
+        self._check(action, last, step)
+        self._actions[action.name] = action
+        self._steps[-1:] = [last, step]
+        self._seen.append(observation(step, self.theory))
+        if self._status is not Status.UNSATISFIABLE:
+            known = self.solution.maps[0] if self._maps or self._drafts else None
+            self._replay(action, step)
+            if not self._settled() and len(self._steps) >= self._next_search:
+                self._ask()
+            self._heed_guess()
+            if self._may_guess():
+                contradicted = known if not self._drafts else None
+                mended = contradicted is not None and self._mend(contradicted, began)
+                if not self._guess and not mended and (contradicted or len(self._steps) >= self._next_guess):
+                    self._begin_guess(contradicted)
+
+    def _check(self, action: Action, last: Step, step: Step) -> None:
+        """Whether a step fits the theory and the steps before."""
+        n = len(self._steps)
+        known = self._actions.get(action.name, action)
+        if known != action:
+            raise TraceError(
+                f"step {n - 1}: action: {brief(action.name)} has kind {action.kind}, turn {action.turn} here but kind {known.kind}, "
+                f"turn {known.turn} before; give the two different names, or the same kind"
+            )
+        self.theory.require(last, f"step {n - 1}")
+        self.theory.require(step, f"step {n}")
+        if self._without_stars and step.star is not None:
+            raise TraceError(f"step {n}: star: expected none, as the first step has none; give all steps stars, or take star=none")
+
+    def _replay(self, action: Action, step: Step) -> None:
+        """Keep the maps that predict the step."""
+        outcomes = [m.follow(action.name, self._seen[-1]) for m in self._maps]
+        lost = [m for m, outcome in zip(self._maps, outcomes, strict=True) if outcome is Outcome.UNKNOWN]
+        self._maps = [m for m, outcome in zip(self._maps, outcomes, strict=True) if outcome is Outcome.PREDICTED]
+        self._drafts = [s for s in self._drafts if s.extend(action, step)]
+        self._sketches = [s for s in self._sketches if s.extend(action, step)]
+        self._complete = self._complete and Outcome.UNKNOWN not in outcomes
+        if self.theory.without:
+            self._maps = []
+        if not self._maps:
+            if self._status is Status.OPTIMAL:
+                self._next_search = 0  # the cost was proven, so the next one may be
+            self._status, self._complete = Status.UNKNOWN, False
+            for m in lost[:DRAFTS]:
+                self._draft(m.map(), len(self._steps) - 1)
+
+    def _draft(self, ssh_map: SSHMap, steps: int) -> None:
+        """Let a map of so many steps go on like a sketch, unless it contradicts the steps since."""
+        if self.theory.without:
+            return
+        sketch = Sketch.beyond(ssh_map, self.trace.prefix(steps), self.theory)
+        since = zip(self._steps[steps - 1 :], self._steps[steps:], strict=False)
+        if all(sketch.extend(before.action, step) for before, step in since if before.action):
+            self._drafts = sorted([*self._drafts, sketch], key=self._rank)[:DRAFTS]
+
+    def _mend(self, ssh_map: SSHMap, began: float) -> bool:
+        """Let a map of fewer steps that the last ones contradict go on, with what does not fit as something new. False where there is no time for that."""
+        assert self._limit is not None
+        steps, now = len(self._steps), time.perf_counter()
+        if now - began + self._mending * steps**2 > self._limit:
+            return False
+        from ssh_abduction.online.background import mended_map  # loads numpy
+
+        mended = mended_map(self.trace, self.theory, ssh_map, self._speedups)
+        self._mending = (time.perf_counter() - now) / steps**2
+        if mended:
+            self._draft(mended, steps)
+        return True
+
+    def _rank(self, sketch: Sketch) -> tuple[int, ...]:
+        return Cost.of(sketch.map()).preferred_by(self.theory)
+
+    def _may_guess(self) -> bool:
+        """Whether a small map is wanted, and the steps are not too many to be compared in pairs."""
+        return self._status is Status.UNKNOWN and self._limit is not None and self.theory.has_frames and len(self._steps) <= AT_ONCE
+
+    def _heed_guess(self) -> None:
+        """Take the map that came of a guess."""
+        if self._guess and self._guess.done():
+            guess, self._guess = self._guess, None
+            found = guess.map()
+            if found and self._status is Status.UNKNOWN:
+                self._draft(found, len(found.labels))
+
+    def _begin_guess(self, known: SSHMap | None) -> None:
+        """Begin a guess where no map is known to be minimal, or let a map that is contradicted be mended."""
+        from ssh_abduction.online.background import MapGuess  # loads numpy
+
+        if not known:
+            self._next_guess = int(GUESS_AGAIN * len(self._steps))
+        self._guess = MapGuess.begun(self._steps, self.theory, self._speedups, known)
+
+    def _settled(self) -> bool:
+        """Whether clingo could add nothing."""
+        return self._status is Status.OPTIMAL and (self._complete or len(self._maps) == self._most)
+
+    def _ask(self) -> None:
+        """Let clingo say what the minimal maps are, or the best map it finds in time."""
+        self.searches += 1
+        known = self._maps[0].map() if self._status is Status.OPTIMAL else None
+        search = Search(
+            self.trace, self.theory, limit=self._limit, maps=self._most, speedups=self._speedups, after=self._search, minimal=known
+        )
+        found = tuple(search)
+        self._search = search
+        steps = len(self._steps)
+        self._next_search = max(steps + PAUSE, int(RETRY * steps)) if search.stopped in ("time limit", "interrupted") else 0
+        self._asked = search.solution()
+        if search.status in (Status.OPTIMAL, Status.UNSATISFIABLE) or self.theory.without:
+            self._status, self._complete, self._cost = search.status, search.complete, self._asked.cost
+            self._drafts = []
+            if len(found) >= len(self._maps) or known is None:
+                self._maps = [_Replayed(m, self._seen) for m in found]
+        elif found:
+            self._draft(found[0], steps)
+
+    def _answer(self, began: float) -> Solution:
+        assert self._search is not None
+        assert self._asked is not None
+        status, cost, maps = self._status, self._cost, tuple(m.map() for m in self._maps)
+        if status is Status.UNKNOWN and (sketch := self._best_sketch()):
+            maps = (sketch.map(),)
+            status, cost = Status.FEASIBLE, Cost.of(maps[0])
+        last = self._asked
+        asked = last.steps == len(self._steps)
+        return Solution(
+            status=status,
+            maps=maps,
+            cost=cost if maps else None,
+            bound=self._search.bound,
+            complete=self._complete,
+            theory=self.theory,
+            steps=len(self._steps),
+            prefix=self._search.prefix,
+            evidence=last.evidence,
+            seconds=Seconds(time.perf_counter() - began, last.seconds.ground if asked else 0.0, last.seconds.solve if asked else 0.0),
+            stopped=None if self._complete else self._search.stopped,
+        )
+
+    def _best_sketch(self) -> Sketch | None:
+        """The best draft that the checker finds consistent, or else a sketch of all steps, if there is one."""
+        while self._drafts:
+            draft = self._drafts[0]
+            if not draft.certain:
+                draft.certain = not check(self.trace, draft.map(), self.theory)
+            if draft.certain:
+                return draft
+            del self._drafts[0]
+        return self._sketches[0] if self._sketches else None
+
+
+class _Replayed:
+    """A map, with the labels of the steps that it has predicted since."""
+
+    def __init__(self, ssh_map: SSHMap, seen: Sequence[object]) -> None:
+        self._map = ssh_map
+        self._labels = list(ssh_map.labels)
+        self._links = {(s, action): x for s, action, x in ssh_map.links}
+        self._sights = dict(zip(self._labels, seen, strict=True))
+
+    def follow(self, action: str, seen: object) -> Outcome:
+        """What the map says of a step."""
+        there = self._links.get((self._labels[-1], action))
+        if there is None:
+            return Outcome.UNKNOWN
+        if self._sights[there] != seen:
+            return Outcome.CONTRADICTED
+        self._labels.append(there)
+        return Outcome.PREDICTED
+
+    def map(self) -> SSHMap:
+        """The map of all steps so far."""
+        return replace(self._map, labels=tuple(self._labels))

@@ -1,0 +1,1 @@
+"""Every minimal map of a trace."""

@@ -1,0 +1,1 @@
+"""A trace as integers, and what follows from it alone."""

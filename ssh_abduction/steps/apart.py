@@ -1,0 +1,160 @@
+"""Which steps cannot be one dstate, whatever the map: a lower bound on dstates that anybody can check.
+
+Two steps are *apart* if some actions, done from both, lead to different views: as a dstate has one view and actions are
+deterministic, they are different dstates. On a trace, what was done from a step is how the trace goes on; so the steps are apart if
+their continuations show different views before, or when, the actions differ. Steps that are pairwise apart, a *clique*, need as many
+dstates as they are, in every theory that holds the axioms functional_view and deterministic. A `Certificate` is such a clique.
+
+*Claim.* The graph of the steps that are apart is a cograph (Corneil, Lerchs, Stewart Burlingham 1981), so a largest clique takes no search.
+*Proof.* Write down what was seen and done from each step on, a view and an action by turns, and put steps in groups by how that begins.
+Where the steps of a group next differ in views, those of different subgroups are all apart: a largest clique is one of each subgroup,
+together. Where they differ in actions, none of them are: it is the largest of those of the subgroups. ∎
+
+>>> from ssh_abduction.steps.apart import Continuations
+>>> Continuations([0, 1, 0, 2, 0], [0, 0, 0, 0]).clique()
+[0, 1, 2, 3]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+SWAPS = 60  # attempts to better the clique of a view, at most; fewer where it has few steps
+
+Matrix = NDArray[np.bool_]
+
+
+class Continuations:
+    """How a trace goes on from each of its steps.
+
+    Steps are sorted by that, as in a suffix array (Manber, Myers 1993), in n log² n: what two steps have in common is the least that
+    any two neighbours from the one to the other have.
+    """
+
+    def __init__(self, seen: Sequence[int], actions: Sequence[int]) -> None:
+        """
+        seen     what was seen at each step
+        actions  what was done after each step but the last, numbered from 0
+        """
+        shown, done = np.asarray(seen), np.append(np.asarray(actions, dtype=int), -1) + 1
+        steps = len(shown)
+        ranks = [_ranked(shown * (done.max() + 1) + done)]  # by the first 1, 2, 4, … views and actions
+        while ranks[-1].max() < steps - 1:
+            then = np.zeros(steps, dtype=int)
+            ahead = 1 << (len(ranks) - 1)
+            then[:-ahead] = ranks[-1][ahead:] + 1
+            ranks.append(_ranked(ranks[-1] * (steps + 1) + then))
+        self._place = ranks[-1]  # of each step, among those sorted
+        self._sorted = np.argsort(self._place)
+        here, there = self._sorted[:-1], self._sorted[1:]
+        for level in range(len(ranks) - 2, -1, -1):  # to where they differ
+            ahead = (ranks[level][here] == ranks[level][there]) * (1 << level)
+            here, there = here + ahead, there + ahead
+        self._shared = 2 * (here - self._sorted[:-1]) + (shown[here] == shown[there])  # views and actions that neighbours have in common
+
+    def apart_from(self, step: int, actions: int = 0) -> Matrix:
+        """Which steps are apart from this one, so that it takes so many actions, at least, to see that: a row of `apart`."""
+        place, steps = self._place[step], len(self._place)
+        shared = np.empty(steps, dtype=int)
+        shared[:place] = np.minimum.accumulate(self._shared[:place][::-1])[::-1]
+        shared[place + 1 :] = np.minimum.accumulate(self._shared[place:])
+        differ = (shared % 2 == 0) & (shared >= 2 * actions)  # views are the first to differ
+        differ[place] = False
+        row: Matrix = differ[self._place]
+        return row
+
+    def apart(self) -> Matrix:
+        """Which pairs of steps are apart: steps x steps."""
+        steps = len(self._place)
+        apart = np.empty((steps, steps), dtype=bool)
+        for step in range(steps):
+            apart[step] = self.apart_from(step)
+        return apart
+
+    def clique(self) -> list[int]:
+        """A largest clique of steps, in order; among the largest, one whose steps are apart from most."""
+        # Of groups that go on, each within the one before, what its steps have in common, and its clique so far:
+        begun: list[tuple[int, _Clique]] = []
+        for step, shared in zip(self._sorted.tolist(), [*self._shared.tolist(), -1], strict=True):
+            clique = _Clique((step,), 0, 1)
+            while begun and begun[-1][0] >= shared:
+                common, before = begun.pop()
+                clique = before.joined(clique, apart=common % 2 == 0)
+            begun.append((shared, clique))
+        return sorted(begun[0][1].steps)
+
+
+@dataclass(frozen=True, slots=True)
+class _Clique:
+    """A largest clique of some group of steps.
+
+    apart  from how many steps of the group its steps are apart, in all
+    group  how many steps that has
+    """
+
+    steps: tuple[int, ...]
+    apart: int
+    group: int
+
+    def joined(self, other: _Clique, *, apart: bool) -> _Clique:
+        """A largest clique of two groups together; all steps of the one are apart from all of the other, or none are."""
+        group = self.group + other.group
+        if apart:
+            more = len(self.steps) * other.group + len(other.steps) * self.group
+            return _Clique(self.steps + other.steps, self.apart + other.apart + more, group)
+        best = max(self, other, key=lambda clique: (len(clique.steps), clique.apart, -clique.steps[0]))
+        return _Clique(best.steps, best.apart, group)
+
+
+def _ranked(keys: NDArray[np.int_]) -> NDArray[np.int_]:
+    """The number of each key among all there are, by size."""
+    return np.unique(keys, return_inverse=True)[1]
+
+
+def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
+    """A large clique of nodes, in order, whatever tells them apart. As nodes with different views always are, each view has a clique of its own."""
+    shown = np.asarray(seen)
+    found: list[int] = []
+    for view in range(int(shown.max()) + 1):
+        steps = np.flatnonzero(shown == view)
+        found += [int(steps[i]) for i in _clique(apart[np.ix_(steps, steps)])]
+    return sorted(found)
+
+
+def large_clique(apart: Matrix) -> list[int]:
+    """A large clique of a few nodes: the largest of those that are found greedily from each node on."""
+    random = np.random.default_rng(0)
+    found = [_filled(apart, [node], random) for node in range(len(apart))]
+    largest: list[int] = max(found, key=len, default=[])
+    return sorted(largest)
+
+
+def _clique(apart: Matrix) -> list[int]:
+    """Greedily the step that is apart from most of those left, then swaps: take some out, fill up again, keep what is no smaller."""
+    random = np.random.default_rng(0)
+    best = _filled(apart, [], random)
+    for _ in range(min(SWAPS, len(apart) // 8) if 1 < len(best) < len(apart) else 0):
+        kept = random.permutation(best)[random.integers(1, len(best)) :]
+        other = _filled(apart, kept.tolist(), random)
+        best = other if len(other) >= len(best) else best
+    return best
+
+
+def _filled(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:
+    """A clique that no step can be added to."""
+    left = np.flatnonzero(apart[kept].all(axis=0)) if kept else np.arange(len(apart))
+    found = list(kept)
+    inner = apart[np.ix_(left, left)]
+    degree = inner.sum(axis=0)
+    free = np.arange(len(left))  # of those left, the ones that are apart from all found
+    while len(free):
+        best = free[int((degree[free] + random.random(len(free))).argmax())]
+        found.append(int(left[best]))
+        stay = inner[best, free]
+        degree -= inner[free[~stay]].sum(axis=0)  # each is left out once, so a whole clique costs no more than the matrix is large
+        free = free[stay]
+    return found

@@ -1,0 +1,79 @@
+"""Why no map has fewer dstates, for anybody to check (`proof.py`).
+
+>>> from ssh_abduction import Trace, solve
+>>> trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
+>>> solve(trace).certificate.clique
+(0, 1, 2, 3)
+>>> solve(trace).certificate.words(trace)[0, 2]
+('travel',)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import Any
+
+from ssh_abduction.errors import SolverError
+from ssh_abduction.trace import Trace
+
+RESTS_ON = frozenset({"functional_view", "deterministic"})  # the axioms that make apart steps different dstates
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """Why no map has fewer dstates.
+
+    clique   steps that are pairwise apart, so that each is a dstate of its own; proof.check_bound checks it, without a solver
+    refuted  numbers of dstates, from the size of the clique up, for which clingo found that there is no map
+    """
+
+    clique: tuple[int, ...]
+    refuted: tuple[int, ...] = ()
+
+    @property
+    def bound(self) -> int:
+        """The number of dstates that every map has at least."""
+        return len(self.clique) + len(self.refuted)
+
+    def words(self, trace: Trace) -> dict[tuple[int, int], tuple[str, ...]]:
+        """For each pair of steps of the clique the common actions that lead from them to different views. Raises SolverError."""
+        return {pair: _word(trace, *pair) for pair in combinations(self.clique, 2)}
+
+    def to_dict(self, trace: Trace) -> dict[str, Any]:
+        """Plain data. Pairs that show different views at once need no word, and are left out."""
+        words = [[i, j, list(word)] for (i, j), word in self.words(trace).items() if word]
+        return {"clique": list(self.clique), "words": words, "refuted": list(self.refuted)}
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a certificate is worked out from once it is asked for: a short trace is solved in the time that this takes.
+
+    views    what was seen at the first steps of the trace, and
+    actions  what was done, both as numbers
+    bound    so many dstates every map has, as far as is proven
+    """
+
+    views: tuple[int, ...]
+    actions: tuple[int, ...]
+    bound: int
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        from ssh_abduction.steps.apart import Continuations  # loads numpy, which takes longer than to solve a short trace
+
+        clique = tuple(Continuations(self.views, self.actions).clique())
+        return Certificate(clique, tuple(range(len(clique), self.bound)))
+
+
+def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:
+    word: list[str] = []
+    while True:
+        here, there = trace.steps[i + len(word)], trace.steps[j + len(word)]
+        if here.view != there.view:
+            return tuple(word)
+        if here.action is None or there.action is None or here.action.name != there.action.name:
+            raise SolverError(f"clique: expected steps that are apart, got {i} and {j}, which may be one dstate")
+        word.append(here.action.name)

@@ -1,0 +1,276 @@
+"""What the steps of a trace are to an engine that settles dstates by themselves: nodes, the links between them, and which nodes are apart.
+
+To the causal theory each step is a node, and each action a link to the next. In a theory where places have frames (star=frame), a turn
+rotates by known quarters: so the steps between two travels, a *visit*, are at one place, and those of a visit that face the same way are
+one node, linked by rotations both ways. Nodes are apart if that follows from what was seen and done, as in `apart.py`.
+
+>>> from ssh_abduction import Theory, Trace
+>>> from ssh_abduction.steps.chart import Chart
+>>> from ssh_abduction.steps.log import Log
+>>> star = [0, 0, 1, 0], [1, 0, 0, 0]
+>>> trace = Trace.from_steps(["a", "b", "a"], ["around", "around"], stars=[star[0], star[1], star[0]])
+>>> chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
+>>> chart.node_of, chart.links
+((0, 1, 0), ((0, -2, 1), (1, -2, 0)))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, TypeAlias
+
+from ssh_abduction.steps.log import Log
+from ssh_abduction.trace import Trace, TurnDirection
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ssh_abduction.steps.apart import Continuations
+
+Link: TypeAlias = tuple[int, int, int]  # node, action, node
+QUARTERS: dict[TurnDirection | None, int] = {"right": 1, "around": 2, "left": 3}
+
+
+class NoFrame(Exception):  # noqa: N818 - not an error
+    """Some visit does not fit a frame: the theory has no map of the trace."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Nodes, numbered by the first step at them, and links.
+
+    seen     the observation at each node
+    links    node, action, node. A rotation by J quarters is the action -J
+    node_of  the node of each step
+    """
+
+    seen: tuple[int, ...]
+    links: tuple[Link, ...]
+    node_of: Sequence[int]
+
+    @staticmethod
+    def of_steps(log: Log, size: int) -> Chart:
+        """The chart of the first steps, each a node."""
+        return Chart(tuple(log.seen[:size]), tuple((t, log.actions[t], t + 1) for t in range(size - 1)), range(size))
+
+    def apart(self) -> NDArray[np.bool_]:
+        """Which pairs of nodes are apart: nodes x nodes."""
+        return self.continuations.apart()
+
+    @cached_property
+    def continuations(self) -> Continuations:
+        """How the trace goes on from each node."""
+        from ssh_abduction.steps.apart import Continuations  # loads numpy
+
+        return Continuations(self.seen, [action for _, action, _ in self.links])
+
+    def is_map(self, labels: Sequence[int]) -> bool:
+        """Whether the labels of all nodes are those of a map: each dstate shows one view, and each action leads to one dstate."""
+        view: dict[int, int] = {}
+        leads: dict[tuple[int, int], int] = {}
+        return (
+            min(labels) >= 0
+            and all(view.setdefault(label, seen) == seen for label, seen in zip(labels, self.seen, strict=True))
+            and all(leads.setdefault((labels[t], action), labels[u]) == labels[u] for t, action, u in self.links)
+        )
+
+    @staticmethod
+    def turned(trace: Trace, log: Log, size: int) -> FramedChart:
+        """The chart of the first steps, as if places had frames; what is seen ahead, right, back and left takes the place of stars.
+
+        A guess: the causal theory does not say that turns rotate. Raises NoFrame where some action is neither turn nor travel, or where
+        what is seen after a turn does not follow from what was seen before.
+        """
+        return Chart.framed(trace, log, size, Chart.around(trace, log, size))
+
+    @staticmethod
+    def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]]:
+        """What is seen ahead, right, back and left where something is seen ahead, as turns show. Raises NoFrame as `turned` does."""
+        after: dict[tuple[int, int], int] = {}  # what is seen, and quarters to the right: what is seen then
+        for action, before, then in zip(trace.actions[: size - 1], log.seen, log.seen[1:], strict=False):
+            if action.kind is None:
+                raise NoFrame
+            if action.turn:
+                quarters = QUARTERS[action.turn]
+                if after.setdefault((before, quarters), then) != then or after.setdefault((then, 4 - quarters), before) != before:
+                    raise NoFrame
+        return {seen: _around(seen, after) for seen in dict.fromkeys(log.seen[:size])}
+
+    @staticmethod
+    def framed(trace: Trace, log: Log, size: int | None = None, around: Mapping[int, Sequence[int]] | None = None) -> FramedChart:
+        """The chart of the first steps (default all), where places have frames. Raises NoFrame.
+
+        around  what is seen ahead, right, back and left where something is seen ahead: in the place of stars
+        """
+        size = len(trace) if size is None else size
+        node: dict[tuple[int, int], int] = {}
+        seen: list[int] = []
+        node_of: list[int] = []
+        stars: list[tuple[int, ...]] = []  # of each visit, in a frame whose slot 0 the robot faces as it arrives
+        travels: list[tuple[int, int, int]] = []
+        visit = slot = 0
+        for t in range(size):
+            if t and (action := trace.actions[t - 1]).kind == "travel":
+                visit, slot = visit + 1, 0
+            elif t:
+                slot = (slot + QUARTERS[action.turn]) % 4
+            openings = (trace.steps[t].openings if around is None else around[log.seen[t]]) or ()
+            star = tuple(int(openings[(k - slot) % 4]) for k in range(4))
+            if visit == len(stars):
+                stars.append(star)
+            if (here := node.setdefault((visit, slot), len(seen))) == len(seen):
+                seen.append(log.seen[t])
+            if seen[here] != log.seen[t] or stars[visit] != star:
+                raise NoFrame
+            node_of.append(here)
+            if t and action.kind == "travel":
+                travels.append((node_of[-2], log.actions[t - 1], here))
+        rotations = [
+            (s, -((k - j) % 4), x) for (v, j), s in node.items() for k in range(4) if k != j and (x := node.get((v, k))) is not None
+        ]
+        links = sorted([*travels, *rotations], key=lambda link: max(link[0], link[2]))
+        return FramedChart(tuple(seen), tuple(links), tuple(node_of), tuple(node), tuple(stars), tuple(travels))
+
+
+@dataclass(frozen=True)
+class FramedChart(Chart):
+    """A chart of visits.
+
+    facing   visit and slot of each node; a slot counts quarters clockwise from how the robot faced as it arrived
+    stars    what is open on each visit, by slot; or what is seen there
+    travels  the links that are travels, in order: the visit's number is that of the travel after it
+    elsewhere  pairs of nodes known to be at different places
+    """
+
+    facing: tuple[tuple[int, int], ...]
+    stars: tuple[tuple[int, ...], ...]
+    travels: tuple[Link, ...]
+    elsewhere: Collection[tuple[int, int]] = ()
+
+    def __getstate__(self) -> dict[str, object]:
+        """To another process goes what is given, and not the large arrays that were made of it."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def apart(self, most: int | None = None, others: Sequence[int] | None = None) -> NDArray[np.bool_]:
+        """Which pairs of nodes, of the first `most` if so many are given, are apart, or which of them and these others, nodes x others:
+        no frame has both visits so turned that the two nodes are one dstate.
+
+        From the last visit to the first: visits do not fit if they show different things, or if the same action,
+        done facing the same way, leads to visits that do not fit as they are.
+        """
+        import numpy as np
+
+        facing = np.asarray(self.facing[:most])
+        visits, slots = facing.T
+        other_visits, other_slots = (facing if others is None else facing[list(others)]).T
+        apart = np.empty((len(visits), len(other_visits)), dtype=bool)
+        for slot in range(4):
+            rows = np.flatnonzero(slots == slot)
+            for other_slot in range(4):
+                columns = np.flatnonzero(other_slots == other_slot)
+                apart[np.ix_(rows, columns)] = self.misfits[(other_slot - slot) % 4][np.ix_(visits[rows], other_visits[columns])]
+        apart |= (visits[:, None] == other_visits) & (slots[:, None] != other_slots)
+        return apart
+
+    @cached_property
+    def leaves(self) -> dict[int, tuple[int, int]]:
+        """The slot that a visit ends at, and the action there, which leads to the next visit."""
+        return {visit: (self.facing[node][1], action) for visit, (node, action, _) in enumerate(self.travels)}
+
+    def turns(self, trace: Trace) -> list[tuple[int, str, int]]:
+        """Turns from node to node, each once, in the order of the trace."""
+        steps = zip(pairwise(self.node_of), trace.actions, strict=False)
+        return list(dict.fromkeys((s, action.turn, x) for (s, x), action in steps if action.turn))
+
+    def beginning(self, visits: int) -> FramedChart:
+        """The chart of the first so many visits."""
+        nodes = next((node for node, (visit, _) in enumerate(self.facing) if visit == visits), len(self.facing))
+        steps = next((step for step, node in enumerate(self.node_of) if node >= nodes), len(self.node_of))
+        links = tuple(link for link in self.links if max(link[0], link[2]) < nodes)
+        return FramedChart(
+            self.seen[:nodes], links, self.node_of[:steps], self.facing[:nodes], self.stars[:visits], self.travels[: visits - 1]
+        )
+
+    def visits_with(self, pairs: int) -> int:
+        """How many of the first visits have so many pairs, at most, that may be one."""
+        import numpy as np
+
+        return int(np.searchsorted(self.fitting, pairs, side="right")) - 1
+
+    @cached_property
+    def fitting(self) -> NDArray[np.int_]:
+        """How many pairs `fits` has of so many of the first visits, 0 to all; these may be too many to list."""
+        import numpy as np
+
+        return np.cumsum([0, *np.count_nonzero(np.triu(~self.misfits, 1), axis=(0, 1))])
+
+    def fits(self, visits: Sequence[int]) -> list[tuple[int, int, int]]:
+        """Visits I < J of these, which are in order, that may be at one place, and R, where slot 0 of I is then slot R of J."""
+        import numpy as np
+
+        some = np.asarray(visits)
+        turns, first, second = np.nonzero(np.triu(~self.misfits[:, some[:, None], some], 1))
+        return list(zip(some[first].tolist(), some[second].tolist(), turns.tolist(), strict=True))
+
+    @cached_property
+    def misfits(self) -> NDArray[np.bool_]:
+        """quarters x visits x visits: slot 0 of the first visit cannot be the slot of that number of the second."""
+        import numpy as np
+
+        visits = len(self.stars)
+        views = np.full((visits, 4), -1)
+        for (visit, slot), seen in zip(self.facing, self.seen, strict=True):
+            views[visit, slot] = seen
+        number: dict[tuple[int, ...], int] = {}
+        # stars[r] is a number for each visit's star, as seen from its slot r
+        stars = [np.array([number.setdefault(star[r:] + star[:r], len(number)) for star in self.stars]) for r in range(4)]
+        leaves = np.full(visits, -1)  # the slot that a visit ends at, none for the last
+        action = np.full(visits, -1)
+        for visit, (slot, done) in self.leaves.items():
+            leaves[visit], action[visit] = slot, done
+        misfits = np.zeros((4, visits, visits), dtype=bool)
+        for s, x in self.elsewhere:
+            misfits[:, self.facing[s][0], self.facing[x][0]] = misfits[:, self.facing[x][0], self.facing[s][0]] = True
+        for i in range(visits - 1, -1, -1):
+            for r in range(4):
+                row = misfits[r, i]
+                row |= stars[r] != stars[0][i]
+                for slot in np.flatnonzero(views[i] >= 0).tolist():
+                    there = views[:, (slot + r) % 4]
+                    row |= (there >= 0) & (there != views[i, slot])
+                if i < visits - 1:
+                    alike = ((leaves[i] + r) % 4 == leaves) & (action == action[i])
+                    row[:-1] |= alike[:-1] & misfits[0, i + 1, 1:]
+        return misfits
+
+
+def numbered(labels: Iterable[Hashable]) -> list[int]:
+    """Labels, numbered by the first step at each."""
+    number: dict[Hashable, int] = {}
+    return [number.setdefault(label, len(number)) for label in labels]
+
+
+def _around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int]:
+    """What is seen ahead, right, back and left where this is seen ahead. Raises NoFrame.
+
+    after  what is seen after a turn, by what was seen before and quarters to the right
+    """
+    views = {0: seen}
+    waiting = [0]
+    while waiting:
+        here = waiting.pop()
+        for quarters in QUARTERS.values():
+            there = (here + quarters) % 4
+            if (then := after.get((views[here], quarters))) is None:
+                continue
+            if there not in views:
+                waiting.append(there)
+            if views.setdefault(there, then) != then:
+                raise NoFrame
+    if len(views) < 4:
+        raise NoFrame
+    return [views[slot] for slot in range(4)]

@@ -1,0 +1,1 @@
+"""Which axioms hold, where they stand, and which speed-ups there are."""

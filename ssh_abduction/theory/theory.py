@@ -1,0 +1,219 @@
+"""Which axioms a map has to satisfy, and which of the consistent maps are preferred.
+
+>>> from ssh_abduction import Theory
+>>> Theory.topological().prefer
+('dstates', 'paths', 'places')
+>>> Theory.causal().axioms
+('functional_view', 'deterministic')
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
+from typing import Any, Literal, TypeAlias
+
+from ssh_abduction.errors import TheoryError, TraceError, brief
+from ssh_abduction.theory import encodings
+from ssh_abduction.trace import Step, Trace
+
+Count: TypeAlias = Literal["dstates", "paths", "places", "excuses"]
+
+CHOICES: dict[str, tuple[str, ...]] = {
+    "level": ("causal", "topological"),
+    "boundary": ("none", "strict", "defeasible"),
+    "path_order": ("partial", "total"),
+    "star": ("auto", "none", "pattern", "frame"),
+}
+COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
+CAUSAL = "Theory.causal() (--theory causal)"  # in error messages
+
+
+@dataclass(frozen=True)
+class Theory:
+    """A choice of axioms and of a preference. Frozen; made by a preset and `replace`, or field by field.
+
+    level            causal (dstates only) or topological (dstates, places, paths)
+    boundary         the axioms of right and left of a path: none, strict, or defeasible (pairs of paths may be excused)
+    symmetric_sides  a turn says four side relations rather than one
+    path_order       whether the order of the places of a path is partial or total
+    next_place       a travel leads to the next place of its path
+    all_on_paths     every dstate is along a path, also the ones never travelled from or to
+    star             the openings seen at a place: none, pattern (agree up to rotation), frame (agree when turned by the
+                     heading, and paths go straight on); auto is frame where the trace has stars, and none elsewhere
+    prefer           what is minimised, first to last, of dstates, paths, places, and, with boundary=defeasible, excuses, which go
+                     first unless named; what is not named is not minimised
+    without          names of axioms left out, to see what they do
+
+    The axioms and their sources are in docs/theory.md; `ssh-abduction theory` prints them.
+    """
+
+    level: Literal["causal", "topological"] = "topological"
+    boundary: Literal["none", "strict", "defeasible"] = "strict"
+    symmetric_sides: bool = True
+    path_order: Literal["partial", "total"] = "total"
+    next_place: bool = False
+    all_on_paths: bool = False
+    star: Literal["auto", "none", "pattern", "frame"] = "auto"
+    prefer: tuple[Count, ...] = ("dstates", "paths", "places")
+    without: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, values in CHOICES.items():
+            if getattr(self, name) not in values:
+                raise TheoryError(f"{name}: expected one of {', '.join(values)}, got {brief(getattr(self, name))}")
+        for name in ("symmetric_sides", "next_place", "all_on_paths"):
+            if not isinstance(getattr(self, name), bool):
+                raise TheoryError(f"{name}: expected true or false, got {brief(getattr(self, name))}")
+        self._set_names("prefer", COUNTS)
+        self._set_names("without", [a.name for a in encodings.axioms()])
+        if self.level == "causal":
+            for name, value in (("boundary", "none"), ("star", "none")):
+                if getattr(self, name) != value:
+                    raise TheoryError(f"{name}: expected {value} with level=causal, got {getattr(self, name)}; take {CAUSAL}")
+            if set(self.prefer) - {"dstates"}:
+                raise TheoryError(f"prefer: expected dstates with level=causal, got {', '.join(self.prefer)}; take {CAUSAL}")
+        if "excuses" in self.prefer and self.boundary != "defeasible":
+            raise TheoryError(f"prefer: expected no excuses with boundary={self.boundary}; take {_choice('boundary', 'defeasible')}")
+
+    def _set_names(self, field: str, allowed: Iterable[str]) -> None:
+        value = getattr(self, field)
+        if not isinstance(value, str | list | tuple):
+            raise TheoryError(f"{field}: expected a list of names, got {brief(value)}")
+        names = tuple(name.strip() for name in value.split(",")) if isinstance(value, str) else tuple(value)
+        known = list(allowed)
+        for i, name in enumerate(names):
+            if name not in known:
+                raise TheoryError(f"{field}: expected names out of {', '.join(known)}, got {brief(name)}")
+            if name in names[:i]:
+                raise TheoryError(f"{field}: expected each name once, got {brief(name)} twice")
+        object.__setattr__(self, field, names)
+
+    @classmethod
+    def causal(cls) -> Theory:
+        """The causal axioms alone, fewest dstates: the smallest Moore machine that explains the trace."""
+        return cls(level="causal", boundary="none", star="none", prefer=("dstates",))
+
+    @classmethod
+    def topological(cls) -> Theory:
+        """All levels, fewest dstates first: closest to the words of Kuipers & Beeson (2002). The default."""
+        return cls()
+
+    @classmethod
+    def circumscriptive(cls) -> Theory:
+        """The same axioms, fewest paths, then places: the preference of Remolina & Kuipers (2004), then fewest dstates."""
+        return cls(prefer=("paths", "places", "dstates"))
+
+    def replace(self, **choices: Any) -> Theory:
+        """This theory with other choices. Raises TheoryError."""
+        unknown = set(choices) - {f.name for f in fields(self)}
+        if unknown:
+            raise TheoryError(f"theory: expected fields out of {', '.join(f.name for f in fields(self))}, got {brief(min(unknown))}")
+        return replace(self, **choices)
+
+    @property
+    def priorities(self) -> tuple[Count, ...]:
+        """What is minimised, first to last, with the excuses of boundary=defeasible in their place."""
+        if self.boundary == "defeasible" and "excuses" not in self.prefer:
+            return ("excuses", *self.prefer)
+        return self.prefer
+
+    @cached_property
+    def axioms(self) -> tuple[str, ...]:
+        """The names of the axioms that hold. With star=auto, those of a trace without stars."""
+        return tuple(a.name for a in encodings.axioms() if a.name not in self.without and a.holds_in(vars(self)))
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether places have frames, and framed.py knows the axioms and the preference."""
+        return (
+            self.star == "frame"
+            and self.priorities[:1] == ("dstates",)
+            and self.boundary in ("none", "strict")
+            and self.path_order == "total"
+            and not (self.next_place or self.all_on_paths or self.without)
+        )
+
+    @property
+    def has_bare_places(self) -> bool:
+        """Whether places have no frames, no stars either, and ways.py knows the axioms and the preference."""
+        return (
+            self.level == "topological"
+            and self.star == "none"
+            and self.priorities[:1] == ("dstates",)
+            and self.boundary in ("none", "strict")
+            and not (self.next_place or self.all_on_paths or self.without)
+        )
+
+    def with_frames(self) -> Theory | None:
+        """A theory in which places have frames and fewest dstates come first, and whose maps, but for their headings, are maps of this one.
+
+        None where there is no such theory, or framed.py does not know it (`has_frames`). The trace need have no stars. Its maps have all axioms of this theory: their paths are totally
+        ordered, their boundaries, if there are any, strict, so that no pair of paths is excused, and stars that agree in a frame are one pattern.
+        """
+        if self.level == "causal":
+            return None
+        boundary = "none" if self.boundary == "none" else "strict"
+        rest = [count for count in self.prefer if count in ("paths", "places")]
+        framed = self.replace(star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest))
+        return framed if framed.has_frames else None
+
+    def resolve(self, trace: Trace) -> Theory:
+        """This theory with `star` settled for a trace, after checking that the trace has what the axioms need.
+
+        Raises TraceError where a view, the kind of an action, or a star is missing, TheoryError where stars are asked for but
+        the trace has none.
+        """
+        star = self.star
+        if star == "auto":
+            star = "frame" if trace.has_stars else "none"
+        if star != "none" and not trace.has_stars:
+            mend = f"add them to the steps, or take {_choice('star', 'none')}"
+            raise TheoryError(f"star: expected a trace with stars for star={star}, got none; {mend}")
+        theory = replace(self, star=star)
+        for i, step in enumerate(trace.steps):
+            theory.require(step, trace.at(i))
+        return theory
+
+    def require(self, step: Step, where: str) -> None:
+        """Raises TraceError, which says where, if a step lacks what the axioms need. Star has to be settled."""
+        if step.view is None:
+            raise TraceError(f"{where}: view: expected one, got only an image; cluster the images into views first (ssh-abduction cluster)")
+        if self.level == "topological" and step.action is not None and step.action.kind is None:
+            raise TraceError(
+                f'{where}: action.kind: expected "travel" or "turn" in a topological theory, got none for {brief(step.action.name)}; '
+                f'write {{"name": …, "kind": "travel"}} or {{"name": …, "kind": "turn", "turn": "right"}}, or take {CAUSAL}'
+            )
+        if self.star == "none":
+            return
+        if step.star is None:
+            raise TraceError(f"{where}: star: expected one, as other steps have stars; add it, or take {_choice('star', 'none')}")
+        try:
+            _ = step.openings
+        except TraceError as error:
+            raise TraceError(f"{where}: {error}, or take {_choice('star', 'none')}") from None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The theory as plain data."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Theory:
+        """The theory that `to_dict` wrote; fields that are missing are those of the level's preset. Raises TheoryError."""
+        if not isinstance(data, Mapping):
+            raise TheoryError(f"theory: expected an object, got {brief(data)}")
+        preset = cls.causal() if data.get("level") == "causal" else cls()
+        return preset.replace(**{str(k): tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+
+
+def _choice(name: str, value: str) -> str:
+    """A choice as an error message names it: in Python, and in the shell."""
+    return f"{name}={value} (--{name} {value})"
+
+
+PRESETS: dict[str, Callable[[], Theory]] = {
+    "causal": Theory.causal,
+    "topological": Theory.topological,
+    "circumscriptive": Theory.circumscriptive,
+}
