@@ -27,9 +27,9 @@ from suite import INSTANCES
 from table import OURS, WITHOUT
 
 from ssh_abduction import Search, Solution, Speedups, Theory, Trace
-from ssh_abduction.asp.asking import peak_memory
+from ssh_abduction.asp.limits import peak_memory
 from ssh_abduction.judge.checker import check
-from ssh_abduction.solver.search import Status
+from ssh_abduction.solver.result import Status
 
 AROUND = 300  # seconds for all that the clock does not count
 MARGIN = 0.1  # how much later than its own limit a solver of ours is ended: time to hand over what it has

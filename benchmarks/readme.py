@@ -1,8 +1,9 @@
-"""Writes the table of a stored run into the README, or into another page.
+"""Writes the tables of a stored run into the pages that show them.
 
-    python benchmarks/readme.py RESULTS.json [PAGE]
+    python benchmarks/readme.py RESULTS.json             # of bench.py: six rows into the README, all rows into docs/performance.md
+    python benchmarks/readme.py RESULTS.json ablation    # of ablation.py: into docs/performance.md
 
-It stands between two comments that mark it; what is around them stays.
+Each table stands between two comments that name it; what is around them stays.
 """
 
 from __future__ import annotations
@@ -17,31 +18,46 @@ from typing import Any
 from table import times
 
 ROOT = Path(__file__).parent.parent
-BLOCK = re.compile(r"(<!-- bench:begin -->\n).*(<!-- bench:end -->)", re.DOTALL)
+PROJECT = "https://github.com/ssh-abduction/ssh-abduction/blob/main"  # links of the README are absolute, as it is shown on PyPI, too
+PAGES = {"six": ROOT / "README.md", "peers": ROOT / "docs" / "performance.md", "ablation": ROOT / "docs" / "performance.md"}
+
+# The rows of the README: three that some peer proves about as soon or sooner, one that nobody proves, and two that only we prove.
+SIX = ("rectangle n=400", "rectangle n=400000", "moore 8/2 n=800", "moore 50/2 n=3200", "moore 100/10 n=3200", "maze 4x4 n=1600")
 
 
-def block(results: dict[str, Any], source: str) -> str:
-    """What stands between the markers: the table, and what it was measured on."""
-    machine, versions = results["machine"], ", ".join(f"{name} {number}" for name, number in results["packages"].items())
+def block(name: str, results: dict[str, Any], path: Path) -> str:
+    """What stands between the markers of a table: the table, what it was measured on, and where it is stored."""
+    machine, versions = results["machine"], ", ".join(f"{package} {number}" for package, number in results["packages"].items())
+    measured = f"{results['date']}, {machine['cpu']}, {machine['cores']} cores"
+    limits = f"{results['limit']:g} s and {results['memory']:,} MiB a cell"
+    if name == "six":
+        shown = times({**results, "cells": [cell for cell in results["cells"] if cell["instance"] in SIX]})
+        return f"{_narrow(shown)}\n\n{measured}; {limits}. From [this run]({PROJECT}/{path.relative_to(ROOT).as_posix()}).\n"
     seeds = "one trace of each kind" if results["seeds"] == 1 else f"medians over {results['seeds']} traces of each random kind"
+    source = os.path.relpath(path, PAGES[name].parent).replace(os.sep, "/")
     return (
-        f"{times(results)}\n\n"
-        f"{results['date']}, {machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, {versions}; "
-        f"{results['limit']:g} s and {results['memory']:,} MiB a cell, {seeds}. From [`{source}`]({source}).\n"
+        f"{_narrow(times(results))}\n\n"
+        f"{measured}, Python {machine['python']}, {versions}; {limits}, {seeds}. From [`{path.relative_to(ROOT).as_posix()}`]({source}).\n"
     )
 
 
-def rewritten(readme: str, results: dict[str, Any], source: str) -> str:
-    """The README with the table of these results."""
-    return BLOCK.sub(lambda found: found[1] + block(results, source) + found[2], readme)
+def _narrow(table: str) -> str:
+    """The table without the spaces that align its columns: these make up a third of it, and its lines are too long to be read as text."""
+    return re.sub(" {2,}", " ", re.sub("-{3,}", "--", table))
+
+
+def rewritten(page: str, name: str, results: dict[str, Any], path: Path) -> str:
+    """The page with the named table of these results."""
+    marked = re.compile(rf"(<!-- bench:begin {name} -->\n).*?(<!-- bench:end {name} -->)", re.DOTALL)
+    return marked.sub(lambda found: found[1] + block(name, results, path) + found[2], page)
 
 
 def main() -> None:
     path = Path(sys.argv[1]).resolve()
-    page = Path(sys.argv[2]).resolve() if len(sys.argv) > 2 else ROOT / "README.md"
     results = json.loads(path.read_text(encoding="utf-8"))
-    source = os.path.relpath(path, page.parent).replace(os.sep, "/")
-    page.write_text(rewritten(page.read_text(encoding="utf-8"), results, source), encoding="utf-8")
+    for name in sys.argv[2:] or ["six", "peers"]:
+        page = PAGES[name]
+        page.write_text(rewritten(page.read_text(encoding="utf-8"), name, results, path), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ class Run(clingo.Application):
             sys.exit("run.py: expected facts view(T,V), got none; write them with ssh-abduction facts")
         control.ground([*(("step", [clingo.Number(t)]) for t in range(last + 1)), ("check", [clingo.Number(last)])])
         control.assign_external(clingo.Function("query", [clingo.Number(last)]), True)
+        control.assign_external(clingo.Function("run_by_steps"), True)
         control.solve()
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import PerceptionError
 from ssh_abduction.trace import Trace
+
+LARGEST = 4 * 2**30  # bytes of a sidecar file once unpacked
 
 
 def images_of(trace: Trace) -> NDArray[np.float64]:
@@ -33,6 +35,8 @@ def images_of(trace: Trace) -> NDArray[np.float64]:
             rows.append(table[image] if isinstance(image, int) else image)
         held = rows
     lengths = [len(image) for image in held]  # type: ignore[arg-type]
+    if not lengths[0]:
+        raise PerceptionError(f"{trace.at(0)}: image: expected at least one range, got none; log what the robot saw")
     for i, beams in enumerate(lengths):
         if beams != lengths[0]:
             mend = "give every image the same number of beams"
@@ -46,10 +50,30 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
     path = Path(trace.source or ".").parent / trace.images
     try:
         with path.open("rb") as file:  # numpy leaves a damaged file open
+            _affordable(file)
             data = np.load(file, allow_pickle=False)
             table = data if isinstance(data, np.ndarray) else data["images" if "images" in data else data.files[0]]
-    except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile, EOFError) as error:
-        raise PerceptionError(f"{path}: expected a .npy or .npz file of images: {error}; check the header's images") from None
-    if table.ndim != 2 or not np.issubdtype(table.dtype, np.number):
-        raise PerceptionError(f"{path}: expected a table of images x ranges, got shape {table.shape}; store one image a row")
+            floats = np.issubdtype(table.dtype, np.integer) or np.issubdtype(table.dtype, np.floating)
+            shape = table.shape
+    except OSError as error:
+        raise PerceptionError(
+            f"{path}: expected a .npy or .npz file of images: {error.strerror or error}; check the header's images"
+        ) from None
+    except PerceptionError:
+        raise
+    except Exception as error:  # a damaged archive fails in as many ways as it has parts: zlib.error, MemoryError, AttributeError, …
+        why = f"{type(error).__name__}: {error}"
+        raise PerceptionError(f"{path}: expected a .npy or .npz file of images, got something else ({why}); write it again") from None
+    if len(shape) != 2 or not floats:
+        raise PerceptionError(f"{path}: expected a table of images x ranges, got {table.dtype} of shape {shape}; store one image a row")
     return table.astype(float)
+
+
+def _affordable(file: BinaryIO) -> None:
+    """Raises PerceptionError where an archive, once unpacked, would not fit into memory: a small one may claim to hold anything."""
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            unpacked = sum(part.file_size for part in archive.infolist())
+        if unpacked > LARGEST:
+            raise PerceptionError(f"images: expected at most {LARGEST} bytes once unpacked, got {unpacked}; write fewer images a file")
+    file.seek(0)

@@ -12,18 +12,19 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import skops.io
+from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator
 
 from perception.errors import PerceptionError
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecognizer
 from perception.views import ViewClusterer
-from ssh_abduction.errors import brief
+from ssh_abduction.errors import brief, is_whole
+from ssh_abduction.files import write_file
 
 FORMAT, VERSION = "ssh-recogniser", 1
 OURS = tuple(f"{kind.__module__}.{kind.__qualname__}" for kind in (PlaceRecognizer, ReciprocalTransformer, ViewClusterer))
@@ -43,9 +44,33 @@ class Stored:
     classes: tuple[Any, ...]
     versions: Mapping[str, str]
 
+    def labels(self, images: ArrayLike) -> list[int]:
+        """The label, a whole number, that the model gives each image, (n, d).
+
+        Raises PerceptionError for images of another length than the model learnt, and for a model that was damaged in its file, which
+        shows nowhere else than in its answers.
+        """
+        table = np.asarray(images, np.float64)
+        try:
+            learnt = getattr(self.model, "n_features_in_", table.shape[1])
+            if is_whole(learnt) and learnt != table.shape[1]:
+                raise PerceptionError(
+                    f"images: expected {learnt} ranges, as the recogniser learnt, got {table.shape[1]}; take its own images"
+                )
+            found = np.asarray(self.model.predict(table))
+            labels = [int(label) for label in found]
+            sound = found.shape == (len(table),) and found.dtype.kind in "iu"
+        except PerceptionError:
+            raise
+        except Exception as error:  # what is damaged fails in as many ways as there are parts
+            raise PerceptionError(f"recogniser: expected one that answers, got {type(error).__name__}: {error}; train it again") from None
+        if not sound:
+            raise PerceptionError(f"recogniser: expected whole numbers as labels, got {found.dtype} of shape {found.shape}; train it again")
+        return labels
+
 
 def save(model: Any, path: str | os.PathLike[str]) -> None:
-    """Write a fitted estimator or pipeline of this package's and scikit-learn's types. The file appears whole or not at all.
+    """Write a fitted estimator or pipeline of this package's and scikit-learn's types. A file appears whole or not at all.
 
     Raises PerceptionError where `load` would refuse it, or the file cannot be written.
     """
@@ -54,15 +79,12 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     data = skops.io.dumps({"format": FORMAT, "version": VERSION, "model": model, "classes": classes, "versions": versions})
     if foreign := _foreign(data=data):
         raise PerceptionError(f"{path}: expected a model of types that can be read back, got {', '.join(foreign)}")
-    target = Path(path)
-    draft = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        draft.write_bytes(data)
-        draft.replace(target)
+        write_file(path, data)
     except OSError as error:
-        raise PerceptionError(f"{target}: cannot write the recogniser: {error.strerror or error}; check the folder") from None
-    finally:
-        draft.unlink(missing_ok=True)
+        raise PerceptionError(f"{path}: cannot write the recogniser: {error.strerror or error}; check the folder") from None
+    except ValueError as error:
+        raise PerceptionError(f"output: cannot write the recogniser: {error}; name a file") from None
 
 
 def load(path: str | os.PathLike[str]) -> Stored:
@@ -85,14 +107,20 @@ def load(path: str | os.PathLike[str]) -> Stored:
         raise PerceptionError(
             f"{path}: expected a .skops file that train or save wrote, got something else ({type(error).__name__})"
         ) from error
-    if not isinstance(held, dict) or held.get("format") != FORMAT:
-        raise PerceptionError(f"{path}: expected a file of format {FORMAT}, got another object")
-    if held.get("version") != VERSION:
-        raise PerceptionError(f"{path}: expected version {VERSION}, got {brief(held.get('version'))}; use the program that wrote it")
+    if not isinstance(held, dict) or not isinstance(held.get("format"), str) or held["format"] != FORMAT:
+        raise PerceptionError(f"{path}: expected a file of format {FORMAT}, got another object; write it with train or save")
+    version = held.get("version")
+    if not is_whole(version) or version != VERSION:
+        raise PerceptionError(f"{path}: expected version {VERSION}, got {_kind(version)}; use the program that wrote it")
     for part, kind in (("model", BaseEstimator), ("classes", list), ("versions", dict)):
         if not isinstance(held.get(part), kind):
-            raise PerceptionError(f"{path}: {part}: expected a {kind.__name__}, got {brief(held.get(part))}; save the recogniser again")
+            raise PerceptionError(f"{path}: {part}: expected a {kind.__name__}, got {_kind(held.get(part))}; save the recogniser again")
     return Stored(held["model"], tuple(held["classes"]), held["versions"])
+
+
+def _kind(value: object) -> str:
+    """What a value is, as an error message says it. The text of an object that was tampered with may itself be an error."""
+    return brief(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
 
 
 def _foreign(**source: Any) -> list[str]:

@@ -9,7 +9,6 @@ A world is a JSON file that a user can write (docs/worlds.md), or an occupancy m
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -22,10 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
-from ssh_abduction.errors import brief
+from simulator.occupancy import FARTHEST, read_occupancy
+from ssh_abduction.errors import brief, is_finite, named, printable
+from ssh_abduction.files import parse_json, read_at_most
 
 Array = NDArray[np.float64]
 FORMAT, VERSION = "ssh-world", 1
+NEAREST = 0.01  # metres of reach: the laser sees no wall nearer than that
+LARGEST = 64 * 2**20  # bytes of a world file
 
 
 @dataclass(frozen=True)
@@ -112,43 +115,44 @@ class World:
         if start is not None:
             try:
                 pose = [float(x) for x in start.split(",")]
-            except ValueError:
+            except (ValueError, AttributeError):
                 raise reader.wrong("start", "x,y,degrees", start) from None
             world = replace(world, start=reader.pose(pose, "start"))
         if route is not None:
+            if not isinstance(route, str):
+                raise reader.wrong("route", "actions with commas between", route)
             world = replace(world, route=reader.route(route.split(",")))
         return world if reach is None else replace(world, reach=reader.reach(reach))
 
     @classmethod
     def named(cls, name: str) -> World:
         """A world that ships (notched-rectangle, taylor-hall), or the one in a file: .json, or .yaml of an occupancy map."""
-        shipped = Path(str(files("simulator"))) / "worlds" / f"{name}.json"
-        if shipped.is_file():
-            return cls.load(shipped)
-        if not Path(name).suffix:
-            known = ", ".join(sorted(p.stem for p in shipped.parent.glob("*.json")))
-            raise SimulatorError(f"world: expected one of {known}, or a file, got {brief(name)}")
+        shipped = {path.stem: path for path in (Path(str(files("simulator"))) / "worlds").glob("*.json")}
+        if name in shipped:
+            return cls.load(shipped[name])
+        if not isinstance(name, str) or not Path(name).suffix:
+            raise SimulatorError(
+                f"world: expected one of {', '.join(sorted(shipped))}, or a file, got {brief(name)}; a file ends in .json or .yaml"
+            )
         return cls.from_occupancy(name) if Path(name).suffix in (".yaml", ".yml") else cls.load(name)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> World:
         """The world in a JSON file. Raises SimulatorError that names the field."""
         try:
-            data = json.loads(Path(path).read_text(encoding="utf-8"))
+            data = parse_json(read_at_most(path, LARGEST).decode("utf-8"))
         except OSError as error:
-            raise SimulatorError(f"{path}: expected a readable world: {error.strerror or error}; check the path") from None
-        except (ValueError, RecursionError) as error:
-            raise SimulatorError(f"{path}: expected a world in JSON, got something else ({brief(str(error))}); mend it") from None
+            raise SimulatorError(f"{named(path)}: expected a readable world: {error.strerror or error}; check the path") from None
+        except ValueError as error:
+            raise SimulatorError(f"{named(path)}: expected a world in JSON, got something else ({brief(str(error))}); mend it") from None
         return _Reader(str(path)).world(data)
 
     @classmethod
     def from_occupancy(cls, path: str | os.PathLike[str]) -> World:
         """The walls of an occupancy map as ROS stores it: a YAML file with image, resolution, origin, occupied_thresh, and its PGM."""
-        from simulator.occupancy import read_occupancy
-
         name, segments = read_occupancy(Path(path))
         middle = segments.reshape(-1, 2).mean(0)
-        return cls(name, segments, start=(float(middle[0]), float(middle[1]), 0.0))
+        return cls(printable(name), segments, start=(float(middle[0]), float(middle[1]), 0.0))
 
 
 class _Reader:
@@ -165,7 +169,7 @@ class _Reader:
         if not walls:
             raise self.wrong("polygons", "at least one wall in polygons or segments", [])
         return World(
-            name=str(data.get("name", Path(self.where).stem)),
+            name=self.name(data.get("name", printable(Path(self.where).stem))),
             segments=np.vstack(walls),
             clutter=tuple(self.clutter(c, f"clutter[{i}]") for i, c in enumerate(self.list(data, "clutter"))),
             start=self.pose(data.get("start", [0, 0, 0]), "start"),
@@ -173,6 +177,11 @@ class _Reader:
             reach=self.reach(data.get("reach", 1.0)),
             dstates=tuple(self.dstate(s, f"dstates[{i}]") for i, s in enumerate(self.list(data, "dstates"))),
         )
+
+    def name(self, value: Any) -> str:
+        if not isinstance(value, str):
+            raise self.wrong("name", "a text", value)
+        return value
 
     def wrong(self, name: str, expected: str, value: Any) -> SimulatorError:
         return SimulatorError(f"{self.where}: {name}: expected {expected}, got {brief(value)}; mend it (docs/worlds.md)")
@@ -185,8 +194,8 @@ class _Reader:
 
     def numbers(self, value: Any, count: int, name: str) -> Array:
         good = isinstance(value, list) and len(value) == count
-        if not good or any(isinstance(x, bool) or not isinstance(x, int | float) or not math.isfinite(x) for x in value):
-            raise self.wrong(name, f"{count} finite numbers", value)
+        if not good or not all(is_finite(x) and abs(x) <= FARTHEST for x in value):
+            raise self.wrong(name, f"{count} finite numbers, of at most {FARTHEST:,.0f}", value)
         return np.array(value, dtype=float)
 
     def loop(self, value: Any, name: str) -> Array:
@@ -203,8 +212,8 @@ class _Reader:
         return tuple(value)
 
     def reach(self, value: Any) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
-            raise self.wrong("reach", "metres above 0", value)
+        if not is_finite(value) or not NEAREST <= value <= FARTHEST:
+            raise self.wrong("reach", f"metres above 0, {NEAREST} to {FARTHEST:,.0f}", value)
         return float(value)
 
     def pose(self, value: Any, name: str) -> tuple[float, float, float]:
@@ -216,7 +225,7 @@ class _Reader:
             raise self.wrong(name, "an object with a polygon", value)
         moves = self.numbers(value.get("moves", [0, 0]), 2, f"{name}.moves")
         present = value.get("present", 1.0)
-        if isinstance(present, bool) or not isinstance(present, int | float) or not 0 <= present <= 1:
+        if not is_finite(present) or not 0 <= present <= 1:
             raise self.wrong(f"{name}.present", "a probability", present)
         return Clutter(self.loop(value.get("polygon"), f"{name}.polygon"), (float(moves[0]), float(moves[1])), float(present))
 

@@ -1,14 +1,38 @@
-"""From what a robot saw and did, find the map: every minimal map of distinctive states, places and paths."""
+"""From what a robot saw and did, find the map: every minimal topological map of distinctive states, places and paths.
 
-from ssh_abduction.engines.base import Cost
-from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
-from ssh_abduction.maps import DState, Path, SSHMap
-from ssh_abduction.online.mapper import OnlineMapper
-from ssh_abduction.solver.search import Bound, Progress, Search, Solution, Status, solve
-from ssh_abduction.steps.certificate import Certificate
-from ssh_abduction.theory.speedups import Speedups
-from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Action, Step, Trace
+A name is loaded when it is first used: so the command line begins at once, and hears Ctrl-C from then on.
+"""
+
+from __future__ import annotations
+
+TYPE_CHECKING = False  # as in typing, which takes longer to load than all that is here
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from ssh_abduction.engines.base import Cost
+    from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
+    from ssh_abduction.maps import DState, Path, SSHMap
+    from ssh_abduction.online.mapper import OnlineMapper
+    from ssh_abduction.solver.result import Bound, Progress, Solution, Status
+    from ssh_abduction.solver.search import Search, solve
+    from ssh_abduction.steps.certificate import Certificate
+    from ssh_abduction.theory.speedups import Speedups
+    from ssh_abduction.theory.theory import Theory
+    from ssh_abduction.trace import Action, Step, Trace
+
+_HOMES = {  # module: the names that it exports
+    "engines.base": ("Cost",),
+    "errors": ("MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
+    "maps": ("DState", "Path", "SSHMap"),
+    "online.mapper": ("OnlineMapper",),
+    "solver.result": ("Bound", "Progress", "Solution", "Status"),
+    "solver.search": ("Search", "solve"),
+    "steps.certificate": ("Certificate",),
+    "theory.speedups": ("Speedups",),
+    "theory.theory": ("Theory",),
+    "trace": ("Action", "Step", "Trace"),
+}
 
 __all__ = [
     "Action",
@@ -34,3 +58,18 @@ __all__ = [
     "TraceError",
     "solve",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    import importlib
+
+    for module, names in _HOMES.items():
+        if name in names:
+            value = getattr(importlib.import_module(f"{__name__}.{module}"), name)
+            globals()[name] = value
+            return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import math
+import numbers
+from typing import TypeGuard
+
 
 class SSHError(Exception):
     """Root of the package's errors. Its text is one line: what was expected, what came, how to mend it."""
+
+    def __str__(self) -> str:
+        return printable(super().__str__())  # names of files and views may hold anything
 
 
 class TraceError(SSHError):
@@ -31,5 +38,35 @@ def named(source: object) -> str:
 
 def brief(value: object, width: int = 60) -> str:
     """`value` as an error message shows it: on one line, cut to `width` characters."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except (RecursionError, ValueError):  # nested without end, or a number of thousands of digits
+        text = f"a value of type {type(value).__name__}"
     return text if len(text) <= width else text[: width - 1] + "…"
+
+
+def printable(text: str) -> str:
+    """A text on one line, in which characters that would steer a terminal, or that nobody sees, are escaped."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def is_finite(value: object) -> TypeGuard[float]:
+    """Whether a value is a number (numpy's, too; true and false are none) that a floating-point number can hold."""
+    try:
+        return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # a whole number of more than 308 digits
+        return False
+
+
+def is_whole(value: object) -> TypeGuard[int]:
+    """Whether a value is a whole number (numpy's, too; true and false are none)."""
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+
+
+def is_writable(text: str) -> bool:
+    """Whether UTF-8 can hold a text: half of a surrogate pair cannot be written."""
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import clingo
 
 from ssh_abduction.asp import facts
+from ssh_abduction.asp.rules import check_rules
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
@@ -63,17 +64,19 @@ def explain(trace: Trace, theory: Theory | None = None, stop: Callable[[], bool]
     now and then; when it says yes, Interrupted is raised.
     """
     theory = (theory or Theory.topological()).resolve(trace)
+    theory.check_steps(trace)
+    check_rules(theory)
     whole = len(trace)
-    length = _shortest(whole, lambda n: not _Axioms(_stretch(trace, 0, n), theory, stop).consistent())
+    length = _shortest(whole, lambda n: not _Axioms(trace, theory, stop, 0, n).consistent())
     if length is None:
         return None
     last = length - 1
-    length = _shortest(length, lambda n: not _Axioms(_stretch(trace, last + 1 - n, n), theory, stop).consistent()) or length
+    length = _shortest(length, lambda n: not _Axioms(trace, theory, stop, last + 1 - n, n).consistent()) or length
     first = last + 1 - length
     clashes: dict[str, list[int]] = {}
-    for axiom, step in _Axioms(_stretch(trace, first, length), theory, stop, relaxed=True).smallest_clash():
+    for axiom, step in _Axioms(trace, theory, stop, first, length, relaxed=True).smallest_clash():
         clashes.setdefault(axiom, []).append(first + step)
-    order = [axiom.name for axiom in encodings.axioms()]
+    order = theory.axioms
     found = tuple(Clash(name, tuple(sorted(clashes[name]))) for name in sorted(clashes, key=order.index))
     return Explanation(first, last, found)
 
@@ -97,9 +100,10 @@ def _shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:
 
 
 class _Axioms:
-    """A trace and its axioms in clingo; where `relaxed`, each axiom can be switched at each step."""
+    """Some steps of a trace, as if they were all of it, and their axioms in clingo; where `relaxed`, each axiom can be switched at each step."""
 
-    def __init__(self, trace: Trace, theory: Theory, stop: Callable[[], bool], relaxed: bool = False) -> None:
+    def __init__(self, trace: Trace, theory: Theory, stop: Callable[[], bool], first: int, length: int, *, relaxed: bool = False) -> None:
+        trace, theory = _stretch(trace, first, length), theory.of_steps(first, length)
         self._stop = stop
         if stop():
             raise Interrupted
@@ -114,9 +118,11 @@ class _Axioms:
             facts.theory_facts(theory, len(trace) if relaxed else facts.most_paths(trace, theory, len(trace)))
             + facts.trace_facts(trace, theory, 0, len(trace)),
         )
+        self._control.add("base", [], facts.own_rules(theory))
         steps = [("step", facts.numbers(t)) for t in range(len(trace))]
         self._control.ground([("base", []), *steps, ("check", facts.numbers(last))])
         self._control.assign_external(facts.query(last), True)
+        self._control.assign_external(facts.run_by_steps(), True)
         self._pairs = {facts.active(axiom, t): (axiom, t) for axiom in theory.axioms for t in range(len(trace))} if relaxed else {}
 
     def consistent(self, active: Sequence[clingo.Symbol] = ()) -> bool:

@@ -87,7 +87,12 @@ def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool 
     labels = np.array(maps[choose or 0].labels, np.intp)
     if choose is not None:
         return labels
-    first = [np.unique(m.labels, return_index=True)[1][np.array(m.labels)] for m in maps]
+    for i, ssh_map in enumerate(maps):
+        if len(ssh_map.labels) != len(labels):
+            raise LearnerError(
+                f"maps: expected maps of one trace, {len(labels)} labels each, got {len(ssh_map.labels)} in map {i + 1}; solve one trace"
+            )
+    first = [_first_steps(ssh_map) for ssh_map in maps]
     agreed = np.all([f == first[0] for f in first], axis=0)
     if not agreed.all() or not complete:
         unsure = f"{len(maps)} minimal maps{'' if complete else ' or more'} remain, and agree on {agreed.sum()} of {len(agreed)} labels"
@@ -95,3 +100,9 @@ def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool 
     if not agreed.any():
         raise LearnerError("labels: expected some that all maps agree on, got none; choose a map")
     return np.where(agreed, labels, -1)
+
+
+def _first_steps(ssh_map: SSHMap) -> NDArray[np.intp]:
+    """Of each step, (n,), the first step at its dstate."""
+    _, first, dstates = np.unique(ssh_map.labels, return_index=True, return_inverse=True)
+    return np.asarray(first[dstates], np.intp)

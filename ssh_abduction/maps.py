@@ -12,12 +12,13 @@ import json
 import os
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
-from ssh_abduction.errors import MapError, brief, named
+from ssh_abduction.errors import MapError, brief, is_writable, named, printable
+from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
 from ssh_abduction.trace import View
 
 if TYPE_CHECKING:
@@ -68,6 +69,37 @@ class SSHMap:
         """The same map for a theory in which places have no frames."""
         return replace(self, dstates=tuple(replace(s, heading=None) for s in self.dstates))
 
+    def renumbered(self) -> SSHMap:
+        """The same map with dstates, places and paths numbered by first visit: maps that are the same up to renaming become equal."""
+        visited = [self.dstates[s] for s in dict.fromkeys([*self.labels, *range(len(self.dstates))])]
+        number = {s.id: i for i, s in enumerate(visited)}
+        place = _numbered([*(s.place for s in visited), *self.places])
+        path = _numbered([*(s.path for s in visited), *(p.id for p in self.paths)])
+        faced: dict[int | None, int | None] = {}  # the direction in which each path was first faced
+        for s in visited:
+            faced.setdefault(s.path, s.direction)
+        dstates = tuple(
+            replace(
+                s,
+                id=number[s.id],
+                place=place.get(s.place),
+                path=path.get(s.path),
+                direction=None if s.direction is None else 1 if s.direction == faced[s.path] else -1,
+            )
+            for s in visited
+        )
+        return SSHMap(
+            labels=tuple(number[s] for s in self.labels),
+            dstates=dstates,
+            links=tuple(sorted({(number[s], action, number[x]) for s, action, x in self.links})),
+            places=tuple(sorted(place.values())),
+            paths=tuple(
+                Path(path[p.id], tuple(place[q] for q in (p.order if faced.get(p.id, 1) != -1 else p.order[::-1])))
+                for p in sorted(self.paths, key=lambda p: path[p.id])
+            ),
+            excused=tuple((path.get(h, h), path.get(g, g)) for h, g in self.excused),
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """The map as plain data, as `solve --json` prints it (docs/formats.md)."""
         data: dict[str, Any] = {
@@ -111,6 +143,11 @@ class SSHMap:
             if missing := used - known - {None}:
                 raise MapError(f"{where}: {name}: expected every id that is used, got none for {brief(sorted(missing, key=str))}; add it")
         labels = tuple(read.integer(x, f"labels[{i}]") for i, x in enumerate(read.list(record, "labels")))
+        if not labels:
+            raise read.wrong("labels", "the dstate of each step", [])
+        for name, numbers in (("places", places), ("paths", tuple(p.id for p in paths))):
+            if len(set(numbers)) < len(numbers):
+                raise read.wrong(name, "each id once", list(numbers))
         for i, label in enumerate(labels):
             if label not in ids:
                 raise MapError(f"{where}: labels[{i}]: expected the id of a dstate, got {label}; there are {len(dstates)} dstates")
@@ -121,14 +158,16 @@ class SSHMap:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the map as JSON. Raises MapError."""
         try:
-            FilePath(path).write_text(json.dumps(self.to_dict(), ensure_ascii=False) + "\n", encoding="utf-8")
+            write_file(path, f"{json_line(self.to_dict())}\n".encode())
         except OSError as error:
-            raise MapError(f"{path}: cannot write the map: {error.strerror or error}; check the folder") from None
+            raise MapError(f"{named(path)}: cannot write the map: {error.strerror or error}; check the folder") from None
+        except ValueError as error:
+            raise MapError(f"output: cannot write the map: {error}; name a file") from None
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SSHMap:
         """The map that `save` wrote. Raises MapError."""
-        return cls.from_dict(read_json(path), str(path))
+        return cls.from_dict(read_json(path), named(path))
 
     def to_networkx(self, level: Literal["causal", "topological"] = "causal") -> nx.Graph[Any]:
         """The map as a graph of networkx.
@@ -160,18 +199,22 @@ class SSHMap:
         """The causal graph as GraphML text."""
         import networkx as nx
 
-        graph = self.to_networkx()
-        for _, data in graph.nodes(data=True):
-            data["view"] = xml_text(str(data["view"]))
-        for *_, data in graph.edges(data=True):
-            data["action"] = xml_text(data["action"])
+        causal = self.to_networkx()
+        graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
+        for s, data in causal.nodes(data=True):
+            graph.add_node(s, **{**data, "view": xml_text(str(data["view"]))})
+        for source, target, action in causal.edges(data="action"):
+            name = xml_text(action)
+            key = name if not graph.has_edge(source, target, name) else f"{name} ({graph.number_of_edges(source, target)})"
+            graph.add_edge(source, target, key=key, action=name)
         return "\n".join(nx.generate_graphml(graph))
 
     def to_dot(self) -> str:
         """The causal graph as Graphviz DOT text, with a cluster a place."""
 
         def quoted(text: object) -> str:
-            return '"' + str(text).replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n") + '"'
+            lines = (printable(line) for line in str(text).split("\n"))  # a terminal would obey some characters
+            return '"' + "\\n".join(line.replace("\\", "\\\\").replace('"', '\\"') for line in lines) + '"'
 
         def node(s: DState) -> str:
             course = "" if s.path is None else f"\npath {s.path}{'+' if s.direction == 1 else '-'}"
@@ -186,17 +229,14 @@ class SSHMap:
         return "\n".join([*lines, "}"])
 
 
-def _writable(text: str) -> bool:
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
+def _numbered(ids: Iterable[int | None]) -> dict[int | None, int]:
+    """0, 1, 2, … for each id in the order in which they come."""
+    return {number: i for i, number in enumerate(dict.fromkeys(x for x in ids if x is not None))}
 
 
 def xml_text(text: str) -> str:
-    """A text without the characters that XML cannot hold, each replaced by U+FFFD."""
-    return re.sub("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
+    """A text without the characters that XML cannot hold, or that would steer a terminal, each replaced by U+FFFD."""
+    return re.sub("[^\t\n -~\u00a0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
@@ -204,9 +244,11 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     source = "standard input" if str(path) == "-" else named(path)
     try:
         text = sys.stdin.buffer.read() if str(path) == "-" else FilePath(path).read_bytes()
-        return json.loads(text.decode("utf-8"))
+        return parse_json(text.decode("utf-8"))
     except OSError as error:
         raise MapError(f"{source}: expected a readable file of maps: {error.strerror or error}; check the path") from None
+    except MemoryError:
+        raise MapError(f"{source}: expected a file of maps that fits into memory, got a larger one; list fewer maps (--maps)") from None
     except json.JSONDecodeError as error:
         if error.msg == "Extra data":
             mend = "solve prints a line for each of several traces: take one of them"
@@ -214,8 +256,16 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         raise MapError(
             f"{source}:{error.lineno}: expected JSON, got broken JSON at column {error.colno} ({error.msg}); write it with solve --json"
         ) from None
-    except (ValueError, RecursionError, AttributeError):  # other text, numbers without end, a closed stream
+    except NotFinite as error:
+        raise MapError(
+            f"{source}: {error.field or 'value'}: expected a finite number, got {error.text}; write it with solve --json"
+        ) from None
+    except HalfCharacter as error:
+        raise MapError(f"{source}: expected text, got {error}") from None
+    except (UnicodeDecodeError, AttributeError):  # other text, a closed stream
         raise MapError(f"{source}: expected JSON in UTF-8, got something else; write it with solve --json") from None
+    except ValueError as error:
+        raise MapError(f"{source}: expected JSON, got {error}; write it with solve --json") from None
 
 
 def maps_of(data: Any, where: str) -> list[SSHMap]:
@@ -258,7 +308,7 @@ class _Reader:
     def dstate(self, value: Any, name: str) -> DState:
         record = self.mapping(value, name)
         view = record.get("view")
-        if isinstance(view, bool) or not isinstance(view, str | int) or (isinstance(view, str) and not _writable(view)):
+        if isinstance(view, bool) or not isinstance(view, str | int) or (isinstance(view, str) and not is_writable(view)):
             raise self.wrong(f"{name}.view", "a text or an integer", view)
         direction = self.optional(record.get("direction"), f"{name}.direction")
         path = self.optional(record.get("path"), f"{name}.path")
@@ -285,7 +335,7 @@ class _Reader:
 
     def link(self, value: Any, ids: set[int], name: str) -> tuple[int, str, int]:
         good = isinstance(value, list) and len(value) == 3 and type(value[0]) is type(value[2]) is int and isinstance(value[1], str)
-        if not good or not {value[0], value[2]} <= ids:
+        if not good or not is_writable(value[1]) or not {value[0], value[2]} <= ids:
             raise self.wrong(name, "[dstate, action name, dstate]", value)
         return value[0], value[1], value[2]
 

@@ -10,9 +10,9 @@ A file holds JSON lines: a header, then a line a step with what was seen and the
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
-import operator
 import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,7 +21,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias
 
-from ssh_abduction.errors import TraceError, brief, named
+from ssh_abduction.errors import TraceError, brief, is_finite, is_whole, is_writable, named
+from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
 
 View: TypeAlias = str | int
 Kind: TypeAlias = Literal["travel", "turn"]
@@ -50,7 +51,7 @@ class Action:
 
     def __post_init__(self) -> None:
         name, kind, turn = self.name, self.kind, self.turn
-        if not isinstance(name, str) or not name or "\0" in name:
+        if not isinstance(name, str) or not name or "\0" in name or not is_writable(name):
             raise TraceError(f"action.name: expected a text, got {brief(name)}; name the action")
         if kind not in (None, *_KINDS):
             raise TraceError(f'action.kind: expected "travel" or "turn", got {brief(kind)}; leave it out for other actions')
@@ -105,11 +106,13 @@ class Step:
     def __post_init__(self) -> None:
         if self.view is not None:
             _view(self.view, "view")
+        if self.star is not None:
+            _numbers(self.star, "star")
 
     @staticmethod
     def of(view: View, star: Sequence[float] | None = None, where: str = "step", action: Action | None = None) -> Step:
         """A step from a view and perhaps a star. Raises TraceError that says where."""
-        return Step(_view(view, f"{where}: view"), action, None if star is None else _star(list(star), f"{where}: star"))
+        return Step(_view(view, f"{where}: view"), action, None if star is None else _star(star, f"{where}: star"))
 
     @property
     def openings(self) -> Openings | None:
@@ -151,8 +154,10 @@ class Trace:
     source: str | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.steps, tuple) or not all(isinstance(step, Step) for step in self.steps):
+            raise TraceError(f"steps: expected a tuple of Step, got {brief(self.steps)}; take Trace.from_steps for views and actions")
         if not self.steps:
-            raise TraceError(f"{self.source or 'trace'}: expected at least one step, got none; add what the robot saw first")
+            raise TraceError(f"{named(self.source or 'trace')}: expected at least one step, got none; add what the robot saw first")
         last = len(self.steps) - 1
         types: dict[str, tuple[int, Action]] = {}
         for i, step in enumerate(self.steps):
@@ -195,7 +200,7 @@ class Trace:
 
     def at(self, step: int) -> str:
         """Where a step is, as an error message says it: file and line, or the number of the step."""
-        return f"{self.source}:{step + 2}" if self.source else f"step {step}"
+        return f"{named(self.source)}:{step + 2}" if self.source else f"step {step}"
 
     @classmethod
     def from_steps(
@@ -207,15 +212,17 @@ class Trace:
         name: str | None = None,
     ) -> Trace:
         """A trace from n + 1 views, the n actions between them, and n + 1 stars if there are any. Raises TraceError."""
-        seen, done = list(views), [Action.of(a) for a in actions]
+        seen, done = _listed(views, "views"), [Action.of(a) for a in _listed(actions, "actions")]
         if len(seen) != len(done) + 1:
             raise TraceError(
                 f"trace: expected one view more than actions, got {len(seen)} views and {len(done)} actions; "
                 f"each action leads from one view to the next"
             )
-        openings = [None] * len(seen) if stars is None else list(stars)
+        openings = [None] * len(seen) if stars is None else _listed(stars, "stars")
         if len(openings) != len(seen):
-            raise TraceError(f"trace: expected a star a view, got {len(openings)} stars and {len(seen)} views")
+            raise TraceError(
+                f"trace: expected a star a view, got {len(openings)} stars and {len(seen)} views; give None where none was seen"
+            )
         steps = tuple(
             Step.of(view, star, f"step {i}", done[i] if i < len(done) else None)
             for i, (view, star) in enumerate(zip(seen, openings, strict=True))
@@ -228,7 +235,7 @@ class Trace:
 
     def with_views(self, views: Iterable[View]) -> Trace:
         """This trace with a view a step. Raises TraceError."""
-        seen = list(views)
+        seen = _listed(views, "views")
         if len(seen) != len(self):
             raise TraceError(f"views: expected {len(self)}, one a step, got {len(seen)}")
         return replace(
@@ -250,26 +257,31 @@ class Trace:
             if str(path) == "-":
                 if sys.stdin is None:
                     raise TraceError("standard input: expected a trace, got a closed stream; name a file")
-                return _parse(sys.stdin.buffer, source)
+                return _parse(sys.stdin.buffer, source, source)
             with Path(path).open("rb") as file:
-                return _parse(file, source)
+                return _parse(file, source, str(path))
         except OSError as error:
             raise TraceError(f"{source}: expected a readable trace file: {error.strerror or error}; check the path") from None
         except ValueError as error:  # a null character in the path
             raise TraceError(f"{source}: expected the path of a trace file: {error}") from None
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the trace as JSON Lines. The file appears whole or not at all. Raises TraceError."""
-        target = Path(path)
-        draft = target.with_name(f".{target.name}.{os.getpid()}.part")
+        """Write the trace as JSON Lines. A file appears whole or not at all; a device or a pipe is written into. Raises TraceError."""
+        lines = "".join(line + "\n" for line in self.to_lines())
         try:
-            with draft.open("w", encoding="utf-8") as file:
-                file.writelines(line + "\n" for line in self.to_lines())
-            draft.replace(target)
+            write_file(path, lines.encode("utf-8"))
+        except UnicodeEncodeError as error:
+            half = f"half a character, \\u{ord(error.object[error.start]):04x}"
+            raise TraceError(f"trace: expected texts and file names in UTF-8, got {half}; rename it") from None
         except OSError as error:
-            raise TraceError(f"{target}: cannot write the trace: {error.strerror or error}; check the folder") from None
-        finally:
-            draft.unlink(missing_ok=True)
+            raise TraceError(f"{named(path)}: cannot write the trace: {error.strerror or error}; check the folder") from None
+        except ValueError as error:
+            raise TraceError(f"output: cannot write the trace: {error}; name a file") from None
+
+    @property
+    def digest(self) -> str:
+        """A short digest of what the trace's file says, by which it is known again."""
+        return hashlib.sha256("\n".join(self.to_lines()).encode("utf-8", "backslashreplace")).hexdigest()[:16]
 
     def to_lines(self) -> Iterator[str]:
         """The lines of the trace's file: the header, then a line a step."""
@@ -281,12 +293,13 @@ class Trace:
 
 def _dump(value: Mapping[str, Any]) -> str:
     try:
-        return json.dumps(value, ensure_ascii=False, allow_nan=False)
-    except (TypeError, ValueError) as error:
+        return json_line(value)
+    except (TypeError, ValueError, RecursionError) as error:
         raise TraceError(f"trace: expected what JSON can hold, got {brief(dict(value))} ({error}); mend the field") from None
 
 
-def _parse(file: BinaryIO, source: str) -> Trace:
+def _parse(file: BinaryIO, source: str, path: str) -> Trace:
+    """The trace in a file, which messages call `source`."""
     header: dict[str, Any] | None = None
     steps: list[Step] = []
     actions: dict[str, Action] = {}
@@ -316,35 +329,14 @@ def _parse(file: BinaryIO, source: str) -> Trace:
     if not steps:
         raise TraceError(f"{source}:2: step: expected at least one after the header, got none; add what the robot saw first")
     extra = {k: v for k, v in header.items() if k not in ("format", "version", "name", "images")}
-    return Trace(tuple(steps), name=header.get("name"), images=header.get("images"), extra=extra, source=source)
-
-
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    fields = dict(pairs)
-    if len(fields) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in fields if names.count(name) > 1)
-        raise ValueError(f"the field {brief(twice)} twice; keep one of them")
-    return fields
+    return Trace(tuple(steps), name=header.get("name"), images=header.get("images"), extra=extra, source=path)
 
 
 def _record(raw: bytes, where: str) -> dict[str, Any]:
-    found: list[str] = []
-
-    def constant(text: str) -> float:
-        found.append(text)
-        return math.nan
-
-    def integer(text: str) -> int:
-        if len(text) > 100:
-            raise ValueError("a number of more than 100 digits; shorten it")
-        return int(text)
-
     if b"\0" in raw:
         raise TraceError(f"{where}: line: expected text in UTF-8, got a null byte at column {raw.index(0) + 1}; is this a binary file?")
     try:
-        text = raw.rstrip().decode("utf-8-sig" if where.endswith(":1") else "utf-8")
-        record = json.loads(text, object_pairs_hook=_object, parse_constant=constant, parse_int=integer)
+        record = parse_json(raw.rstrip().decode("utf-8-sig" if where.endswith(":1") else "utf-8"))
     except UnicodeDecodeError as error:
         raise TraceError(
             f"{where}: line: expected text in UTF-8, got the byte 0x{raw[error.start]:02x} at column {error.start + 1}; is this a binary file?"
@@ -353,37 +345,17 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
         raise TraceError(
             f"{where}: line: expected one JSON object, got broken JSON at column {error.colno} ({error.msg}); mend it there"
         ) from None
-    except RecursionError:
-        raise TraceError(f"{where}: line: expected one JSON object, got one nested too deeply; flatten it") from None
+    except NotFinite as error:
+        raise TraceError(
+            f"{where}: {error.field}: expected a finite number, got {error.text}; replace it, or leave the field out"
+        ) from None
+    except HalfCharacter as error:
+        raise TraceError(f"{where}: line: expected text, got {error}") from None
     except ValueError as error:
         raise TraceError(f"{where}: line: expected one JSON object, got {error}") from None
-    if found:
-        raise TraceError(f"{where}: {_where_nan(record)}: expected a finite number, got {found[0]}; replace it, or leave the field out")
-    if b"\\u" in raw:
-        _no_surrogates(record, where)
     if not isinstance(record, dict):
         raise TraceError(f"{where}: line: expected a JSON object in braces, got {brief(record)}; write one step a line")
     return record
-
-
-def _where_nan(value: Any, path: str = "") -> str:
-    """The field in which a value that is no number stands."""
-    inside: Iterable[tuple[Any, Any]] = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, item in inside:
-        here = f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}" if path else str(key)
-        if isinstance(item, float) and math.isnan(item):
-            return here
-        if isinstance(item, dict | list) and (deeper := _where_nan(item, here)):
-            return deeper
-    return ""
-
-
-def _no_surrogates(record: Any, where: str) -> None:
-    """Half a character cannot be written again: refuse it where it comes in."""
-    try:
-        json.dumps(record, ensure_ascii=False).encode("utf-8")
-    except UnicodeEncodeError as error:
-        raise TraceError(f"{where}: line: expected text, got half a character, \\u{ord(error.object[error.start]):04x}; mend it") from None
 
 
 def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -428,15 +400,23 @@ def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> 
     )
 
 
+def _listed(values: Any, name: str) -> list[Any]:
+    if not isinstance(values, Iterable):
+        raise TraceError(f"{name}: expected a list, got {brief(values)}; give one value a step")
+    return list(values)
+
+
 def _view(value: Any, where: str) -> View:
-    if not isinstance(value, bool | str) and hasattr(value, "__index__"):
-        value = operator.index(value)  # such as numpy's
+    if is_whole(value):
+        value = int(value)  # numpy's, too
     if isinstance(value, bool) or not isinstance(value, str | int):
         raise TraceError(f"{where}: expected a text or an integer, got {brief(value)}; name the view")
     if isinstance(value, int) and not -(2**31) < value < 2**31:
         raise TraceError(f"{where}: expected an integer of 32 bits, got {brief(value)}; write it as a text")
     if isinstance(value, str) and "\0" in value:
         raise TraceError(f"{where}: expected a text without null characters, got {brief(value)}; rename the view")
+    if isinstance(value, str) and not is_writable(value):
+        raise TraceError(f"{where}: expected a text that UTF-8 can hold, got half a character in {brief(value)}; rename the view")
     return value
 
 
@@ -461,13 +441,13 @@ def _numbers(value: Any, where: str) -> list[float]:
     if not isinstance(value, list | tuple):
         raise TraceError(f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]")
     for i, x in enumerate(value):
-        if isinstance(x, bool) or not isinstance(x, int | float) or not math.isfinite(x):
+        if not is_finite(x):
             raise TraceError(f"{where}[{i}]: expected a finite number, got {brief(x)}; replace it, or leave the field out")
-    return list(value)
+    return [x if type(x) in (int, float) else int(x) if is_whole(x) else float(x) for x in value]  # numpy's numbers are no JSON
 
 
 def _image(value: Any, where: str) -> tuple[float, ...] | int:
-    if isinstance(value, int) and not isinstance(value, bool):
+    if is_whole(value):
         if value < 0:
             raise TraceError(f"{where}: expected an index of 0 or more into the sidecar file, got {value}; count from 0")
         return value
@@ -475,6 +455,8 @@ def _image(value: Any, where: str) -> tuple[float, ...] | int:
 
 
 def _star(value: Any, where: str) -> tuple[float, ...]:
+    if hasattr(value, "tolist"):
+        value = value.tolist()  # numpy's
     if isinstance(value, list | tuple):
         value = [int(x) if isinstance(x, bool) else x for x in value]
     star = tuple(_numbers(value, where))

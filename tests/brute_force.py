@@ -16,7 +16,7 @@ topological theory also needs the kinds of the actions. `one_place` and `one_cou
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import combinations, product
 from typing import NamedTuple, TypeAlias
 
@@ -66,8 +66,10 @@ def key(ssh_map: SSHMap) -> Key:
     )
 
 
-def minimal_maps(trace: Trace, theory: Theory) -> tuple[Counts | None, set[Key]]:
+def minimal_maps(trace: Trace, theory: Theory, allows: Callable[[Key], bool] = lambda _: True) -> tuple[Counts | None, set[Key]]:
     """The counts and the keys of the consistent maps that come first by `theory.priorities`; (None, empty) where there is none.
+
+    allows  what an axiom says of a map that the brute force does not know
 
     The maps agree in the counts that the theory minimises. The other counts are those of one of them.
     """
@@ -75,6 +77,8 @@ def minimal_maps(trace: Trace, theory: Theory) -> tuple[Counts | None, set[Key]]
     counts: Counts | None = None
     keys: set[Key] = set()
     for found, its_counts in consistent_maps(trace, theory):
+        if not allows(found):
+            continue
         cost = tuple(getattr(its_counts, name) for name in theory.priorities)
         if best is None or cost < best:
             best, counts, keys = cost, its_counts, set()
@@ -90,12 +94,16 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
     defeasible = theory.boundary == "defeasible"
     stars = tuple(step.openings for step in trace)
     for labels in _labellings(trace, on):
+        if "asserted" in on and not _as_asserted(labels, None, theory):
+            continue
         dstates = max(labels) + 1
         if theory.level == "causal":
             yield (labels, (None,) * dstates, (None,) * dstates), Counts(dstates, 0, 0, 0)
             continue
         links = frozenset(zip(labels, trace.actions, labels[1:], strict=False))
         for places in _placings(labels, links, stars, on):
+            if "asserted" in on and not _as_asserted(labels, places, theory):
+                continue
             headings = list(_headings(labels, places, trace.actions, stars, on)) if theory.star == "frame" else []
             if theory.star == "frame" and not headings:
                 continue
@@ -106,6 +114,17 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
                 if excuses is not None:
                     paths = len({course[0] for course in courses if course})
                     yield (labels, places, courses), Counts(dstates, paths, len(set(places)), excuses)
+
+
+def _as_asserted(labels: Labels, places: tuple[int, ...] | None, theory: Theory) -> bool:
+    """Whether dstates, and places where they are given, are as the theory says of pairs of steps that the trace has."""
+    there = [[(i, j) for i, j in pairs if j < len(labels)] for pairs in (theory.same, theory.different, theory.elsewhere)]
+    same, different, elsewhere = there
+    return (
+        all(labels[i] == labels[j] for i, j in same)
+        and all(labels[i] != labels[j] for i, j in different + elsewhere)
+        and (places is None or all(places[labels[i]] != places[labels[j]] for i, j in elsewhere))
+    )
 
 
 # --- dstates: which steps are equal

@@ -2,16 +2,70 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from typing import Any
 
+from brute_force import Key
 from hypothesis import strategies as st
 
+from ssh_abduction.theory.encodings import axioms
+from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import COUNTS, Count, Theory
 from ssh_abduction.trace import STANDARD_ACTIONS, Action, Trace
 
 ACTIONS = (*STANDARD_ACTIONS.values(), Action("creep", "travel"), Action("veer", "turn", "right"))
 # Few openings, so that stars often agree: all alike, a straight street, a corner, a dead end, a tee.
 STARS = ((1, 1, 1, 1), (1, 0, 1, 0), (1, 1, 0, 0), (1, 0, 0, 0), (1, 1, 1, 0))
+
+
+# Axioms that may be left out: the map can't show what holds without these, as a dstate of a map has one place and one course.
+LEFT_OUT = sorted({axiom.name for axiom in axioms()} - {"one_place", "one_course", "one_heading", "turn_rotates", "star_frame", "asserted"})
+
+
+@dataclass(frozen=True)
+class Toy:
+    """An axiom that no speed-up and no checker knows: as rules, and what it says of a map as the brute force has it."""
+
+    rules: Rules
+    allows: Callable[[Key], bool]
+    causal: bool = True
+
+
+def _toy(name: str, part: str, text: str, allows: Callable[[Key], bool], *, causal: bool = True) -> Toy:
+    return Toy(Rules(f"{name}.lp", f"% @axiom({name}) A toy.\n#program {part}(t).\n{text}"), allows, causal)
+
+
+def _seen_at_most_twice(key: Key) -> bool:
+    return all(key[0].count(label) <= 2 for label in key[0])
+
+
+def _near(key: Key) -> bool:
+    return all(j - i <= 2 for j, label in enumerate(key[0]) for i in range(j) if key[0][i] == label)
+
+
+def _short_paths(key: Key) -> bool:
+    _, places, courses = key
+    paths = {course[0] for course in courses if course}
+    return all(len({p for p, course in zip(places, courses, strict=True) if course and course[0] == h}) <= 2 for h in paths)
+
+
+def _even(key: Key) -> bool:
+    return len(set(key[0])) % 2 == 0
+
+
+TOYS = (
+    _toy("near", "step", "violation(near,t) :- same(I,t), t-I > 2.", _near),
+    _toy("seldom", "step", "violation(seldom,t) :- is(t,S), 3 #count { I : is(I,S) }.", _seen_at_most_twice),
+    _toy(
+        "short",
+        "step",
+        "stands(H,P,t) :- at(t,P), along(t,H,D).\nviolation(short,t) :- path(H), 3 #count { P : stands(H,P,T) }.",
+        _short_paths,
+        causal=False,
+    ),
+    _toy("even", "check", "violation(even,t) :- query(t), N = #count { S : is(S,S) }, N \\ 2 = 1.", _even),
+)
 
 
 @st.composite
@@ -30,24 +84,47 @@ def traces(draw: st.DrawFn, max_steps: int = 7) -> Trace:
     return Trace.from_steps(seen, actions, stars=stars)
 
 
+def _seldom(values: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    """An empty tuple in three of four cases."""
+    return st.integers(0, 3).flatmap(lambda n: values if n == 3 else st.just(()))
+
+
+def _pairs(steps: int) -> st.SearchStrategy[list[tuple[int, int]]]:
+    """Few pairs of steps, mostly none."""
+    pairs = [(i, j) for j in range(steps) for i in range(j)]
+    return st.just([]) | (st.lists(st.sampled_from(pairs), max_size=2) if pairs else st.just([]))
+
+
+def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
+    """Values of a field of Theory that suit a topological theory of this trace. A field that this does not know fails every test that draws theories."""
+    return {
+        "level": st.just("topological"),
+        "boundary": st.sampled_from(["none", "strict", "defeasible"]),
+        "symmetric_sides": st.booleans(),
+        "path_order": st.sampled_from(["partial", "total"]),
+        "next_place": st.booleans(),
+        "all_on_paths": st.booleans(),
+        "star": st.sampled_from(["auto", "none", "pattern", "frame"] if trace.has_stars else ["auto", "none"]),
+        "prefer": st.permutations(COUNTS).flatmap(lambda order: st.integers(0, len(order)).map(lambda length: order[:length])),
+        "without": _seldom(st.sampled_from(LEFT_OUT).map(lambda name: (name,))),
+        "rules": _seldom(st.sampled_from(TOYS).map(lambda toy: (toy.rules,))),
+        "same": _seldom(_pairs(len(trace))),
+        "different": _pairs(len(trace)),
+        "elsewhere": _pairs(len(trace)),
+    }[field]
+
+
 @st.composite
-def theories(draw: st.DrawFn, trace: Trace) -> Theory:
-    """Any choice of axioms and preference that a theory of this trace may have. Without a preference every consistent map is minimal."""
-    choices: dict[str, Any] = {
-        "symmetric_sides": draw(st.booleans()),
-        "path_order": draw(st.sampled_from(["partial", "total"])),
-        "next_place": draw(st.booleans()),
-        "all_on_paths": draw(st.booleans()),
-    }
+def theories(draw: st.DrawFn, trace: Trace, plain: bool = False) -> Theory:
+    """Any choice of axioms and preference that a theory of this trace may have. Without a preference every consistent map is minimal.
+
+    plain  without rules, and with all axioms
+    """
+    kept = ("without", "rules") if plain else ()
+    choices: dict[str, Any] = {f.name: draw(choices_of(f.name, trace), label=f.name) for f in fields(Theory) if f.name not in kept}
     if draw(st.integers(0, 9)) == 9:
-        prefer: tuple[Count, ...] = draw(st.sampled_from([("dstates",), ()]))
-        return Theory(level="causal", boundary="none", star="none", prefer=prefer, **choices)
-    boundary = draw(st.sampled_from(["none", "strict", "defeasible"]))
-    counts = [name for name in COUNTS if name != "excuses" or boundary == "defeasible"]
-    order = draw(st.permutations(counts))
-    return Theory(
-        boundary=boundary,
-        star=draw(st.sampled_from(["auto", "none", "pattern", "frame"] if trace.has_stars else ["auto", "none"])),
-        prefer=tuple(order[: draw(st.integers(0, len(order)))]),
-        **choices,
-    )
+        causal = {"level": "causal", "boundary": "none", "star": "none", "prefer": draw(st.sampled_from([("dstates",), ()]))}
+        rules = [rules for rules in choices.get("rules", ()) if next(toy for toy in TOYS if toy.rules == rules).causal]
+        return Theory(**{**choices, **causal, **({} if plain else {"rules": rules})})
+    prefer: tuple[Count, ...] = tuple(name for name in choices["prefer"] if name != "excuses" or choices["boundary"] == "defeasible")
+    return Theory(**{**choices, "prefer": prefer})

@@ -49,6 +49,7 @@ CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
     "one_heading": (FRAME, "c R c", "ahead left", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "turn_rotates": (FRAME, "b L a", "ahead back", (NONE, 0), ((2, 1, 0), 1)),
     "one_dstate_per_heading": (FRAME, "a R b L c", "ahead left ahead", (NONE, 0), ((3, 1, 0), 1)),
+    "asserted": (PLAIN.replace(different=[(0, 2)]), "a R a R a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "path_goes_straight": (FRAME, "a T a A a T a", "back right left left", ((4, 3, 1), 1), ((4, 2, 1), 1)),
 }
 
@@ -86,7 +87,7 @@ def test_an_axiom_has_a_sentence_and_a_source(axiom: Any) -> None:
     assert axiom.source
 
 
-@pytest.mark.parametrize("level", encodings.LEVELS)
+@pytest.mark.parametrize("level", encodings.levels())
 def test_every_violation_in_the_encodings_belongs_to_an_axiom(level: str) -> None:
     text = (encodings.folder() / f"{level}.lp").read_text()
     names = {axiom.name for axiom in encodings.axioms() if axiom.level == level}

@@ -1,4 +1,4 @@
-"""The benchmarks measure what they say: answers are checked, limits hold, and the README shows a stored run."""
+"""The benchmarks measure what they say: answers are checked, limits hold, and the pages show stored runs."""
 
 from __future__ import annotations
 
@@ -155,21 +155,37 @@ def test_a_stored_run_has_its_fields_and_no_contradiction(path: Path) -> None:
     assert table.contradictions(run) == []
 
 
-def test_the_page_on_performance_shows_a_stored_run() -> None:
-    page = ROOT / "docs" / "performance.md"
-    text = page.read_text()
-    run = json.loads((ROOT / "benchmarks" / "results" / "ablation.json").read_text())
-    assert readme.rewritten(text, run, "../benchmarks/results/ablation.json") == text
+def stored(page: str, name: str) -> Path:
+    """The stored run that the named table of a page says it is from."""
+    found = re.search(rf"<!-- bench:begin {name} -->.*(benchmarks/results/[\w.-]+\.json)\).*<!-- bench:end {name} -->", page, re.DOTALL)
+    assert found
+    return ROOT / found[1]
+
+
+@pytest.mark.parametrize("name", readme.PAGES)
+def test_each_table_shows_a_stored_run(name: str) -> None:
+    text = readme.PAGES[name].read_text()
+    run = json.loads(stored(text, name).read_text())
+    assert readme.rewritten(text, name, run, stored(text, name)) == text
+    assert readme.block(name, run, stored(text, name)) in text
+
+
+def test_the_tables_of_peers_are_of_one_run_and_the_short_one_has_six_rows() -> None:
+    path = stored(readme.PAGES["six"].read_text(), "six")
+    assert path == stored(readme.PAGES["peers"].read_text(), "peers")
+    run = json.loads(path.read_text())
+    rows = [line for line in readme.block("six", run, path).splitlines() if line.startswith("| ")]
+    assert len(rows) == 6 + 2
+    assert set(readme.SIX) <= set(SUITE)
+
+
+def test_the_table_of_speedups_has_each_of_them() -> None:
+    run = json.loads(stored(readme.PAGES["ablation"].read_text(), "ablation").read_text())
     off = {cell["tool"].removeprefix("−") for cell in run["cells"]} - {"ssh-abduction", "all"}
     assert off == set(SPEEDUPS)
 
 
-def test_the_readme_shows_a_stored_run(tmp_path: Path) -> None:
-    text = (ROOT / "README.md").read_text()
-    shown = re.search(r"<!-- bench:begin -->.*\]\((benchmarks/results/.*\.json)\).*<!-- bench:end -->", text, re.DOTALL)
-    assert shown
-    run = json.loads((ROOT / shown[1]).read_text())
-    assert readme.rewritten(text, run, shown[1]) == text
+def test_the_picture_of_growth_is_drawn_from_the_run(tmp_path: Path) -> None:
     picture = tmp_path / "growth.png"
-    plot.draw(run, picture)
+    plot.draw(json.loads(stored(readme.PAGES["peers"].read_text(), "peers").read_text()), picture)
     assert picture.stat().st_size > 10_000

@@ -118,6 +118,7 @@ CORRECT = {
 }
 
 BROKEN = {
+    "asserted": case(TOPOLOGICAL.replace(different=[(0, 2)]), seen("a R a R a"), "0 0 0", "0"),
     "functional_view": case(TOPOLOGICAL, seen("a R b"), "0 0", "0"),
     "deterministic": case(TOPOLOGICAL, seen("a R b R a R c"), "0 1 0 2", "0 0 0"),
     "one_place": case(TOPOLOGICAL, seen("a"), "0", "."),

@@ -15,34 +15,25 @@ from hypothesis import strategies as st
 from instances import Walk, maze
 from strategies import STARS
 
-from ssh_abduction import (
-    OnlineMapper,
-    Search,
-    Speedups,
-    Status,
-    Theory,
-    Trace,
-    annealing,
-    encodings,
-    engine,
-    facts,
-    framed,
-    same,
-    solve,
-    solver,
-    streets,
-)
-from ssh_abduction.asp.asking import Stopped, Watch
+from ssh_abduction import OnlineMapper, Search, Speedups, Status, Theory, Trace, solve
+from ssh_abduction.asp import facts
+from ssh_abduction.asp.limits import Stopped, Watch
+from ssh_abduction.engines import base as engine
+from ssh_abduction.engines import framed, streets
+from ssh_abduction.engines import visits as same
 from ssh_abduction.engines.base import Cost, Found
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.engines.nearby import Beside, NearbySearch
+from ssh_abduction.guesses import annealing
 from ssh_abduction.guesses.annealing import Guess, attempts
 from ssh_abduction.guesses.merging import kept, merged_near
 from ssh_abduction.judge.checker import check
 from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver import search as solver
 from ssh_abduction.steps.chart import QUARTERS, Chart, FramedChart, NoFrame, numbered
 from ssh_abduction.steps.log import Log
+from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 PLAIN = Speedups.without(SPEEDUPS)

@@ -13,12 +13,12 @@ from instances import maze
 from strategies import theories, traces
 
 from ssh_abduction import OnlineMapper, Search, Speedups, SSHMap, Status, Theory, Trace, solve
-from ssh_abduction.asp.asking import Paused, Stopped, Watch
+from ssh_abduction.asp.limits import Paused, Stopped, Watch
 from ssh_abduction.engines import framing
 from ssh_abduction.engines.framing import maps_with_frames
-from ssh_abduction.guesses.continuing import Sketch
+from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import check
-from ssh_abduction.solver.search import search as solver
+from ssh_abduction.solver import search as solver
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 THEORIES = {

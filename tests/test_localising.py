@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.instances import Walk, maze
 from ssh_abduction import Search, Theory, solve
-from ssh_abduction.asp.asking import Watch
+from ssh_abduction.asp.limits import Watch
 from ssh_abduction.engines import streets
 from ssh_abduction.engines import visits as same
 from ssh_abduction.engines.framed import FramedEngine

@@ -15,7 +15,7 @@ from test_speedups import PLAIN, machines
 
 from ssh_abduction import Speedups, Status, Theory, Trace, solve
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.asking import Watch
+from ssh_abduction.asp.limits import Watch
 from ssh_abduction.engines import base as engine
 from ssh_abduction.engines import causal as named
 from ssh_abduction.engines import nearby
@@ -23,7 +23,7 @@ from ssh_abduction.engines.nearby import Beside, NearbySearch
 from ssh_abduction.guesses import annealing
 from ssh_abduction.guesses.annealing import annealed
 from ssh_abduction.judge.checker import check
-from ssh_abduction.solver.search import search as solver
+from ssh_abduction.solver import search as solver
 from ssh_abduction.steps.chart import Chart, NoFrame
 from ssh_abduction.steps.log import Log
 

@@ -16,10 +16,10 @@ from strategies import theories, traces
 from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Action, OnlineMapper, Solution, Status, Theory, TheoryError, Trace, TraceError, solve
-from ssh_abduction.guesses.continuing import Sketch
+from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import check
-from ssh_abduction.online.mapper import background as guessing
-from ssh_abduction.online.mapper import mapper as online
+from ssh_abduction.online import background as guessing
+from ssh_abduction.online import mapper as online
 from ssh_abduction.steps.chart import Chart
 from ssh_abduction.steps.log import Log
 from ssh_abduction.theory.speedups import Speedups
@@ -267,7 +267,7 @@ def test_a_guess_ends_with_its_mapper_and_with_the_program() -> None:
 import threading
 from instances import maze
 from ssh_abduction import OnlineMapper
-from ssh_abduction.online.mapper import background as guessing
+from ssh_abduction.online import background as guessing
 guessing.has_processors = lambda _: True
 
 def begun():

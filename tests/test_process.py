@@ -15,7 +15,7 @@ import pytest
 from instances import maze
 
 from ssh_abduction import Theory
-from ssh_abduction.asp.asking import Stopped, Watch, peak_memory
+from ssh_abduction.asp.limits import Stopped, Watch, peak_memory
 from ssh_abduction.asp.process import in_process
 from ssh_abduction.engines.streets import Streets
 from ssh_abduction.steps.chart import Chart
@@ -104,7 +104,7 @@ def test_a_process_ends_with_the_one_that_waits_for_it(tmp_path: Path) -> None:
     path = tmp_path / "written"
     program = f"""
 from pathlib import Path
-from ssh_abduction.asp.asking import Watch
+from ssh_abduction.asp.limits import Watch
 from ssh_abduction.asp.process import in_process
 from test_process import write_again_and_again
 in_process(write_again_and_again, Path({str(path)!r}), watch=Watch())

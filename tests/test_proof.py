@@ -86,9 +86,7 @@ def test_a_short_trace_is_solved_without_numpy() -> None:
     """It takes longer to load than all the rest."""
     program = textwrap.dedent("""
         import sys
-        from ssh_abduction import Trace
-        from ssh_abduction import cli
-        from ssh_abduction import solve
+        from ssh_abduction import Trace, cli, solve
         solution = solve(Trace.from_steps("aba", ["travel", "travel"]))
         print("numpy" in sys.modules)
         print(solution.certificate.clique, "numpy" in sys.modules)

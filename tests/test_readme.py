@@ -1,4 +1,4 @@
-"""The README shows only what really happens."""
+"""The README and the pages of docs/ show only what really happens, and name only what exists."""
 
 from __future__ import annotations
 
@@ -8,56 +8,77 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from ssh_abduction.cli import main
+from ssh_abduction.cli import parser
 from ssh_abduction.picture import svg
-from ssh_abduction.solver.search import Status, solve
+from ssh_abduction.solver.result import Status
+from ssh_abduction.solver.search import solve
+from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text()
-BLOCKS = re.findall(r"```(\w*)\n(.*?)```", README, re.DOTALL)
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+BLOCKS = {page: re.findall(r"```(\w*)\n(.*?)```", page.read_text(), re.DOTALL) for page in PAGES}
+# How links of the README begin, which PyPI shows, too: what follows is the path of a file in this checkout.
+ABSOLUTE = (
+    r"https://(?:github\.com/ssh-abduction/ssh-abduction/(?:blob|tree)|raw\.githubusercontent\.com/ssh-abduction/ssh-abduction)/main/"
+)
+
+FILES = [
+    path
+    for folder in ("benchmarks", "encodings", "examples", "perception", "simulator", "ssh_abduction", "tests")
+    for path in (ROOT / folder).rglob("*.*")
+]
+EXAMPLES = {"own.lp", "run.jsonl", "NAME.lp", "NAME.py"}  # files that a reader has, or makes
+
+
+def shown(language: str) -> list[object]:
+    """The blocks of a language that a block of output follows, each with that output and the page as its name."""
+    found = []
+    for page, blocks in BLOCKS.items():
+        for (said, text), (after, output) in pairwise(blocks):
+            if said == language and not after:
+                found.append(pytest.param(text, output, id=f"{page.stem}-{len(found)}"))
+    return found
 
 
 def without_seconds(text: str) -> str:
     return re.sub(r"\d+\.\d\d s", "_ s", text)
 
 
-def test_the_python_lines_print_what_is_shown() -> None:
-    indices = [i for i, (language, _) in enumerate(BLOCKS) if language == "python"]
-    assert len(indices) == 3
-    for index in indices:
-        with contextlib.redirect_stdout(io.StringIO()) as out:
-            exec(BLOCKS[index][1], {})
-        assert out.getvalue() == BLOCKS[index + 1][1]
+@pytest.mark.parametrize(("program", "output"), shown("python"))
+def test_the_python_lines_print_what_is_shown(program: str, output: str) -> None:
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        exec(program, {})
+    assert out.getvalue() == output
 
 
-def test_the_shell_lines_print_what_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    index, lines = next((i, text.splitlines()) for i, (_, text) in enumerate(BLOCKS) if text.startswith("ssh-abduction solve"))
-    assert len(lines) == 3
+@pytest.mark.parametrize(("lines", "output"), shown("sh"))
+def test_the_shell_lines_print_what_is_shown(lines: str, output: str, tmp_path: Path) -> None:
     (tmp_path / "examples").symlink_to(ROOT / "examples")
-    monkeypatch.chdir(tmp_path)
-    shown = []
+    command = re.sub(r"^ssh-abduction", f"{shlex.quote(sys.executable)} -m ssh_abduction", lines, flags=re.MULTILINE)
+    done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert without_seconds(done.stdout) == without_seconds(output)
+    assert done.returncode == (1 if ": error:" in output else 0)
+
+
+def test_what_is_shown_is_run() -> None:
+    assert (len(shown("python")), len(shown("sh"))) == (4, 4)
+
+
+def test_the_command_line_knows_all_that_is_shown() -> None:
+    lines = [line for blocks in BLOCKS.values() for _, text in blocks for line in text.splitlines() if line.startswith("ssh-abduction ")]
+    assert len(lines) > 10
     for line in lines:
-        command, _, target = line.partition(" > ")
-        with contextlib.redirect_stdout(io.StringIO()) as out:
-            assert main(shlex.split(command)[1:]) == 0
-        if target:
-            (tmp_path / target).write_text(out.getvalue())
-        shown.append(out.getvalue())
-    assert without_seconds(shown[0]) == without_seconds(BLOCKS[index + 1][1])
-    assert shown[2].strip() in README
-
-
-def test_the_line_of_many_traces_prints_what_is_shown() -> None:
-    index, line = next((i, text) for i, (_, text) in enumerate(BLOCKS) if text.startswith("ssh-abduction solve examples/*"))
-    command = line.replace("ssh-abduction", f"{shlex.quote(sys.executable)} -m ssh_abduction", 1)
-    done = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert without_seconds(done.stdout) == without_seconds(BLOCKS[index + 1][1])
+        words = shlex.split(re.split(r" > | \| ", line)[0], comments=True)
+        assert parser().parse_args(words[1:]), line
 
 
 def test_the_trace_of_the_formats_page_has_a_map(tmp_path: Path) -> None:
@@ -71,8 +92,63 @@ def test_the_picture_is_the_map() -> None:
     assert (ROOT / "docs" / "notched-rectangle.svg").read_text() == svg(ssh_map) + "\n"
 
 
-def test_every_file_it_names_exists() -> None:
-    named = re.findall(r"\]\(([^)#:]+)\)", README) + re.findall(r"(?:examples|benchmarks|docs|ssh_abduction)/[\w./-]+\w", README)
-    assert len(named) > 5
-    for name in named:
-        assert (ROOT / name).exists(), name
+def test_the_readme_is_short_and_its_links_are_whole() -> None:
+    text = README.read_text()
+    assert len(text.encode()) <= 8192
+    links = re.findall(r"\]\(([^)]+)\)|^\[\w+\]: (\S+)|src=\"([^\"]+)\"", text, re.MULTILINE)
+    assert len(links) > 5
+    assert all("".join(link).startswith("https://") for link in links)
+    named = set(re.findall(r"\]\[(\w+)\]", text))
+    assert named == set(re.findall(r"^\[(\w+)\]: ", text, re.MULTILINE))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_file_it_names_exists(page: Path) -> None:
+    text = page.read_text()
+    linked = [page.parent / name for name in re.findall(r"\]\(([^)#:]+)\)", text)]
+    whole = [ROOT / name for name in re.findall(ABSOLUTE + r"([\w./-]+\w)", text)]
+    folders = r"(?<![\w./-])(?:benchmarks|docs|encodings|examples|perception|simulator|ssh_abduction|tests)/[\w./-]+\w"
+    said = [ROOT / name for name in re.findall(folders, text)]
+    for path in (*linked, *whole, *said):
+        assert path.exists(), path
+    for name in re.findall(r"`([\w./-]+\.(?:py|lp|jsonl?))`", text):  # pages name modules from the folder that they are in on
+        assert any(path.match(name) for path in FILES) or Path(name).name in EXAMPLES, name
+    assert page != README or len(whole) > 5
+
+
+def test_the_design_has_a_sentence_for_each_module() -> None:
+    sections = dict(re.findall(r"\n### (\w+):.*?\n(.*?)(?=\n##)", (ROOT / "docs" / "design.md").read_text(), re.DOTALL))
+    for path in sorted((ROOT / "ssh_abduction").rglob("[a-z]*.py")):
+        folder = path.relative_to(ROOT / "ssh_abduction").parts[0] if path.parent.name != "ssh_abduction" else "ssh_abduction"
+        rows = [line for line in sections[folder].splitlines() if f"`{path.stem}`" in line.split(" | ")[0]]
+        assert rows, path
+
+
+def test_the_design_tells_the_floors_as_they_are_checked() -> None:
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
+    (told,) = re.findall(r"From the top: (.*?)\. ", (ROOT / "docs" / "design.md").read_text(), re.DOTALL)
+    assert [set(re.findall(r"`(\w+)`", floor)) for floor in told.split(";")] == [
+        set(re.findall(r"(\w+)(?= \||$)", layer)) for layer in layers
+    ]
+
+
+def test_the_rule_of_the_theory_page_is_obeyed() -> None:
+    (rule,) = [text for language, text in BLOCKS[ROOT / "docs" / "theory.md"] if language == "prolog"]
+    trace = Trace.load(ROOT / "examples" / "notched-rectangle.jsonl").prefix(24)
+    assert fewest(trace, Theory.causal()) == 4
+    assert fewest(trace, Theory.causal().replace(rules=[Rules("own.lp", rule)])) == 16
+
+
+def fewest(trace: Trace, theory: Theory) -> int | None:
+    cost = solve(trace, theory).cost
+    return cost and cost.dstates
+
+
+def test_contributors_are_told_of_names_that_are_there() -> None:
+    text = (ROOT / "docs" / "contributing.md").read_text()
+    code = "\n".join(path.read_text() for path in FILES if path.suffix in (".py", ".lp"))
+    names = set(re.findall(r"`([A-Z_]{4,}|[A-Z][a-z]+|\w+_\w+)`", text)) - {"NAME", "FIELD"}
+    assert {"SURVIVE_A_CUT", "SPOKEN_FOR", "KINDS", "AXIOMS", "Evidence"} <= names
+    for name in names:
+        assert re.search(rf"\b{name}\b", code), name

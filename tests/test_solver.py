@@ -19,21 +19,21 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
-import ssh_abduction.engine as engine_module
 from hypothesis import given, settings
 from strategies import theories, traces
 from worlds import TOURS, drive, rectangle, written
 
-import ssh_abduction.solver as solver_module
 from benchmarks.instances import maze
 from ssh_abduction import Progress, Search, SolverError, Speedups, SSHMap, Status, Theory, TheoryError, Trace, TraceError, solve
 from ssh_abduction.asp.facts import links_of
+from ssh_abduction.engines import base as engine_module
 from ssh_abduction.engines.base import Found
 from ssh_abduction.engines.causal import NamedEngine
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.errors import SSHError
 from ssh_abduction.explain import Interrupted, explain
 from ssh_abduction.judge.checker import check
+from ssh_abduction.solver import search as solver_module
 from ssh_abduction.steps.log import Log, Outcome
 
 THEORIES = {"causal": Theory.causal(), "topological": Theory.topological(), "circumscriptive": Theory.circumscriptive()}
@@ -228,8 +228,7 @@ def test_ctrl_c_leaves_the_best_map() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
         sys.path.insert(0, sys.argv[1])
         from test_solver import too_hard
-        from ssh_abduction import Theory
-        from ssh_abduction import solve
+        from ssh_abduction import Theory, solve
         print("ready", flush=True)
         solution = solve(too_hard(), Theory.causal())
         print(solution.stopped, solution.status.value, solution.bound.dstates is not None)
@@ -248,8 +247,7 @@ def test_a_stream_that_is_left_does_not_abort_python() -> None:
     """It still has a search of clingo's, in a thread, when Python ends."""
     program = textwrap.dedent("""
         import sys
-        from ssh_abduction import Search
-        from ssh_abduction import Trace
+        from ssh_abduction import Search, Trace
         maps = iter(Search(Trace.load(sys.argv[1]).without_stars(), maps=1))
         print(len(next(maps).labels))
     """)

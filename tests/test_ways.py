@@ -12,13 +12,13 @@ from instances import maze
 from strategies import traces
 
 from ssh_abduction import Search, Speedups, Status, Theory, Trace, solve
-from ssh_abduction.asp.asking import Watch
+from ssh_abduction.asp.limits import Watch
 from ssh_abduction.engines import causal as named
 from ssh_abduction.engines import frameless as ways
 from ssh_abduction.engines.frameless import WaysEngine
 from ssh_abduction.judge.checker import check
 from ssh_abduction.judge.proof import check_bound
-from ssh_abduction.solver.search import search as solver
+from ssh_abduction.solver import search as solver
 from ssh_abduction.steps.log import Log
 from ssh_abduction.theory.speedups import SPEEDUPS
 

@@ -1,8 +1,13 @@
-"""Between Python and clingo: a trace becomes facts, an answer set becomes a map. No other module knows a predicate's name."""
+"""Between Python and clingo: a trace becomes facts, an answer set becomes a map. No other module knows a predicate's name.
+
+What is told of many steps is told at once: the step is an argument of a fact, and one call grounds the rules for all of them. A part of the
+program for each step makes the same rules cost about thirty times as much to ground, so only the readable encodings, which are mostly
+grounded for short prefixes, have such parts.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from itertools import pairwise, permutations
@@ -13,6 +18,8 @@ from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 from ssh_abduction.maps import DState, Path, SSHMap
 from ssh_abduction.steps.chart import Chart, FramedChart
 from ssh_abduction.theory import encodings
+from ssh_abduction.theory.evidence import Equality, evidence_of
+from ssh_abduction.theory.speedups import TRAVELS_AND_TURNS
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Action, Trace
 
@@ -23,12 +30,7 @@ _Ahead: TypeAlias = tuple[int, int, int]  # a path, and two places of which the 
 
 def encoding_names(theory: Theory) -> tuple[str, ...]:
     """The encodings that a theory needs, in the order to load them."""
-    names = ["causal"]
-    if theory.level == "topological":
-        names += ["topological"]
-        names += ["boundary"] if theory.boundary != "none" else []
-        names += ["star"] if theory.star in ("pattern", "frame") else []
-    return (*names, "preference", "show")
+    return (*encodings.needed_by(vars(theory)), "preference", "show")
 
 
 def theory_facts(theory: Theory, paths: int) -> str:
@@ -44,9 +46,19 @@ def _preferred(theory: Theory) -> list[str]:
     return [f"prefer({count},{len(theory.priorities) - i})." for i, count in enumerate(theory.priorities)]
 
 
+def own_rules(theory: Theory) -> str:
+    """The user's own rules. Their axioms hold like those of the encodings."""
+    return "\n".join(rules.text for rules in theory.rules)
+
+
+def run_by_steps() -> Symbol:
+    """The external atom that says that the program parts of steps are grounded: without it the encodings have no answer."""
+    return Function("run_by_steps")
+
+
 def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
     """The most paths that a map of the first steps can have: a path begins at the start, or where a turn right or left ends."""
-    if theory.without:
+    if TRAVELS_AND_TURNS & theory.given_up:
         return steps
     return 1 + sum(action.turn in ("right", "left") for action in trace.actions[: steps - 1])
 
@@ -64,7 +76,19 @@ def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
     facts += [f"act({t},{_constant(action.name)})." for t, action in done.items()]
     if theory.level == "topological":
         facts += [_kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None]
-    return "\n".join(facts)
+    return "\n".join([*facts, *_evidence_facts(trace, theory, start, stop)])
+
+
+def _evidence_facts(trace: Trace, theory: Theory, start: int, stop: int) -> Iterator[str]:
+    """What evidence says of these steps, and of pairs of them with earlier ones."""
+    for evidence in evidence_of(theory):
+        pairs = evidence.pairs(trace)
+        for t in range(start, stop) if pairs else ():
+            yield from (f"excluded({evidence.name},{i},{t})." for i in pairs.apart.get(t, ()))
+            if theory.level == "topological":
+                yield from (f"elsewhere({evidence.name},{i},{t})." for i in pairs.elsewhere.get(t, ()))
+            yield from (f"one({i},{t})." for i in pairs.one.get(t, ()))
+        yield evidence.facts(trace, start, stop)
 
 
 def program(trace: Trace, theory: Theory) -> str:
@@ -76,6 +100,7 @@ def program(trace: Trace, theory: Theory) -> str:
             f"%   python run.py --project=project --opt-mode=optN -n 0 THIS_FILE {files}",
             theory_facts(theory, most_paths(trace, theory, len(trace))),
             trace_facts(trace, theory, 0, len(trace)),
+            own_rules(theory),
             "",
         ]
     )
@@ -340,6 +365,12 @@ def forbidden_pairs(
     return f":- {', '.join(body if listed is None else [f'listed({listed})', *body])}."
 
 
+def forbidden_equalities(equalities: Iterable[Equality]) -> str:
+    """The rule that these equalities of steps do not all hold."""
+    atoms = [f"same{'' if e.of == 'dstate' else '_place'}({min(e.first, e.second)},{max(e.first, e.second)})" for e in equalities]
+    return f":- {', '.join(atoms)}."
+
+
 _number = cache(Number)  # half the time of a symbol, where there are many
 
 
@@ -364,6 +395,9 @@ def street_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
     facts = [f"turned({s},{x},{-action})." for s, action, x in chart.links if action < 0]
     facts += [f"travel({s},{x})." for s, _, x in chart.travels]
     facts += [f"around({s},{x})." if turn == "around" else f"bend({s},{turn},{x})." for s, turn, x in chart.turns(trace)]
+    facts += [f"unlike({s},{x})." for s, x in chart.excluded]
+    visits = {(chart.facing[s][0], chart.facing[x][0]): (s, x) for s, x in chart.away}
+    facts += [f"away({s},{x})." for s, x in visits.values()]
     return "\n".join([*facts, side_facts(theory)])
 
 
@@ -381,11 +415,18 @@ def way_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
 
 
 def course_facts(
-    theory: Theory, dstates: Iterable[int], links: Iterable[tuple[int, int, int]], actions: Mapping[int, Action], *, single: bool = False
+    theory: Theory,
+    dstates: Iterable[int],
+    links: Iterable[tuple[int, int, int]],
+    actions: Mapping[int, Action],
+    far: Iterable[tuple[int, int]] = (),
+    *,
+    single: bool = False,
 ) -> str:
     """Dstates, the numbered actions that link them, and what is preferred, as facts for courses.lp; or for single courses."""
     facts = [side_facts(theory), *(["total."] if theory.path_order == "total" else []), *(["single."] if single else [])]
     facts += [f"is({x})." for x in dstates]
+    facts += [f"far({x},{y})." for x, y in far]
     facts += [f"turn({s},{turn},{x})." if (turn := actions[a].turn) else f"travel({s},{x})." for s, a, x in links]
     return "\n".join([*facts, *_preferred(theory)])
 
@@ -463,9 +504,9 @@ def read_contraries(model: Model) -> list[int]:
     return sorted(args[0] for name, args in map(_atom, model.symbols(shown=True)) if name == "contrary")
 
 
-def forbidden_links(links: Iterable[tuple[int, int, int]]) -> str:
-    """The rule that these links of named dstates do not go together."""
-    return f":- {', '.join(f'goes({s},{a},{x})' for s, a, x in links)}."
+def forbidden_links(links: Iterable[tuple[int, int, int]], placed: Iterable[tuple[int, int]] = ()) -> str:
+    """The rule that these links of named dstates do not go together while these steps are at these dstates."""
+    return f":- {', '.join([*(f'goes({s},{a},{x})' for s, a, x in links), *(f'is({t},{s})' for t, s in placed)])}."
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,8 @@
-"""Work in a process of its own, which has a processor to itself: of the threads of one process but one runs Python at a time, and but one grounds."""
+"""Work in a process of its own, which has a processor to itself: of the threads of one process but one runs Python at a time, and but one grounds.
+
+Guesses are much Python, and so is the search beside them: as two threads they take three times as long. And two threads that ground at
+once wait for each other at each symbol, so within one process one waits for the other to end (`asp/control.py`).
+"""
 
 from __future__ import annotations
 
@@ -13,10 +17,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TypeVar
 
-from ssh_abduction.asp.asking import POLL, Stopped, Watch
+from ssh_abduction.asp.limits import POLL, Stopped, Watch
 
 Result = TypeVar("Result")
 
+_under_way: set[subprocess.Popen[bytes]] = set()
 _SERVE = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from ssh_abduction.asp.process import serve; serve()"
 
 
@@ -50,6 +55,7 @@ def _run(work: Callable[..., object], arguments: tuple[object, ...], watch: Watc
         subprocess.Popen([sys.executable, "-c", _SERVE], stdin=subprocess.PIPE, stdout=answer, stderr=subprocess.DEVNULL) as process,
     ):
         assert process.stdin
+        _under_way.add(process)
         try:
             with suppress(BrokenPipeError):
                 for sent in (sys.path, (work, arguments, watch.memory_left())):
@@ -61,9 +67,16 @@ def _run(work: Callable[..., object], arguments: tuple[object, ...], watch: Watc
                     process.wait(POLL)
         finally:
             process.kill()
+            _under_way.discard(process)
         answer.seek(0)
         return process.returncode, answer.read()
     return 1, b""
+
+
+def end_all() -> None:
+    """End all processes that this one waits for, as it is about to end itself."""
+    for process in list(_under_way):
+        process.kill()
 
 
 def serve() -> None:

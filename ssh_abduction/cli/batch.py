@@ -15,18 +15,23 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-from ssh_abduction.cli import EXIT_ERROR, EXIT_INTERRUPTED
+from ssh_abduction.asp.control import Grounding
+from ssh_abduction.asp.limits import Stop as SearchStop
+from ssh_abduction.cli import EXIT_ERROR, EXIT_INTERRUPTED, workers
+from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import theory_of
-from ssh_abduction.cli.solve import dump, ending, exit_code, explained, on_ctrl_c, opening
+from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, interrupted_code, on_ctrl_c, opening, warn, warnings_of
 from ssh_abduction.cli.text import headline
-from ssh_abduction.errors import SolverError, SSHError, brief, named
+from ssh_abduction.errors import SolverError, SSHError, brief, named, printable
+from ssh_abduction.explain import Explanation
+from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
@@ -39,15 +44,23 @@ Task: TypeAlias = tuple[int, str]  # the number of a trace, and its path
 
 PATIENCE = 10  # seconds for a Dask scheduler, and for its first worker, to answer
 KILLED = "process: expected an answer, got killed, as happens when memory runs out; set --memory-limit, or solve fewer traces at a time"
+GUARDED, OVERDUE = (
+    1.2,
+    3.0,
+)  # times the time limit, and seconds beyond that, or after Ctrl-C, after which a process has no answer: its own guard ends it before
+LATE = (
+    "process: expected an answer in time, got none, as happens when memory is swapped; set --memory-limit, or solve fewer traces at a time"
+)
 LOST = "scheduler: expected an answer, got disconnected; see whether it still runs, and solve this trace again"
 
 
 class Answer(NamedTuple):
-    """The result of one trace: the number of the trace, the line to print, and the exit code."""
+    """The result of one trace: the number of the trace, the line to print, the exit code, and what is to be said on stderr."""
 
     number: int
     line: str
     code: int
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,19 +105,58 @@ class Question:
         search = Search(
             trace, self.theory, limit=self.limit, maps=self.maps, memory=self.memory, speedups=self.speedups, on_progress=on_progress
         )
-        with on_ctrl_c(search.interrupt):
-            maps = [ssh_map.to_dict() for ssh_map in search if self.json]
+        maps: list[dict[str, Any]] = []
+        with self._guarded(number, path, search, maps, given_up):
+            for ssh_map in search:
+                maps += [ssh_map.to_dict()] if self.json else []
             explanation = explained(search)
-        solution = search.solution()
+            return self._told(number, path, search, search.solution(), maps, explanation, search.grounding)
+
+    def _guarded(
+        self, number: int, path: str, search: Search, maps: list[dict[str, Any]], given_up: Callable[[], bool]
+    ) -> contextlib.AbstractContextManager[object]:
+        """What answers in time, in a process that does nothing else, where the search cannot be ended."""
+
+        def last_words(why: SearchStop) -> tuple[Answer, int]:
+            solution = search.snapshot(why)
+            found = [*maps] or [ssh_map.to_dict() for ssh_map in solution.maps if self.json]
+            return self._told(
+                number, path, search, solution, found, None, Grounding(0, 0)
+            ), EXIT_ERROR  # of the process, which nobody reads
+
+        if not workers.serves():
+            return contextlib.nullcontext()
+        return Guard(search.interrupt, last_words, self.limit, self.memory, given_up=given_up, print_last=workers.reply)
+
+    def _told(
+        self,
+        number: int,
+        path: str,
+        search: Search,
+        solution: Solution,
+        maps: Sequence[dict[str, Any]],
+        explanation: Explanation | None,
+        grounding: Grounding,
+    ) -> Answer:
         if self.json:
-            line = dump({"trace": path, **opening(search), "maps": maps, **ending(search, solution, explanation)})
+            count = len(maps)
+            line = dump({"trace": path, **opening(search), "maps": maps, **ending(search, solution, explanation, count, grounding)})
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
-        return Answer(number, line, exit_code(solution))
+        return Answer(number, line, exit_code(solution), tuple(warnings_of(search, solution)))
+
+    @property
+    def overdue(self) -> float | None:
+        """Seconds after which a process that was to answer is taken for lost."""
+        return None if self.limit is None else GUARDED * self.limit + OVERDUE
+
+    def lost(self, lost: workers.Lost, path: str) -> Answer:
+        """The answer for a trace whose process ended without one."""
+        return self.failed(lost.number, path, SolverError(LATE if lost.late else KILLED))
 
     def failed(self, number: int, path: str, error: Exception) -> Answer:
         """The answer for a trace that was not solved."""
-        message = " ".join((str(error) if isinstance(error, SSHError) else f"{type(error).__name__}: {error}").split())
+        message = printable(" ".join((str(error) if isinstance(error, SSHError) else f"{type(error).__name__}: {error}").split()))
         line = dump({"trace": path, "status": "error", "error": message}) if self.json else f"{named(path)}: error: {message}"
         return Answer(number, line, EXIT_ERROR)
 
@@ -130,7 +182,7 @@ def run(options: argparse.Namespace) -> int:
     if stopped:
         missing = len(paths) - sum(code != EXIT_INTERRUPTED for code in codes)
         print(f"ssh-abduction: interrupted: {missing} of {len(paths)} traces not finished", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return interrupted_code()
     if errors := codes.count(EXIT_ERROR):
         print(f"ssh-abduction: errors in {errors} of {len(paths)} traces, on their lines", file=sys.stderr)
         return EXIT_ERROR
@@ -147,6 +199,7 @@ def _printed(answers: Generator[Answer], total: int, stop: Stop) -> list[int]:
             for answer in answers:
                 with on_ctrl_c(stop.set):  # so that no line is lost or cut in two
                     lines[answer.number] = answer.line
+                    warn(answer.warnings)
                     codes.append(answer.code)
                     advance()
                     while turn in lines:
@@ -161,27 +214,28 @@ def _printed(answers: Generator[Answer], total: int, stop: Stop) -> list[int]:
     return codes
 
 
-def _here(question: Question, paths: Sequence[str], jobs: int, stop: Stop) -> Generator[Answer]:
-    """Answers from processes of this machine; with one job, from this process. Once it is to stop, those of traces under way, as far as these are."""
-    from joblib import effective_n_jobs
-    from joblib.externals.loky import get_reusable_executor
+def _solved_in_worker(number: int, path: str, question: Question, given_up: Callable[[], bool]) -> Answer:
+    return question.answer(number, path, None, given_up)
 
-    warnings.filterwarnings("ignore", module="joblib")  # about processes that ended early: the answers say it better
-    processes = min(effective_n_jobs(jobs), len(paths))
-    if processes == 1:
-        yield from _answers(question, paths, partial(_in_processes, question, 1, stop))
-        return
+
+def _here(question: Question, paths: Sequence[str], jobs: int, stop: Stop) -> Generator[Answer]:
+    """Answers from processes of this machine. Once it is to stop, those of traces under way, as far as these are.
+
+    A process that is killed loses its trace alone. These processes do not hear Ctrl-C themselves: they are told of it.
+    """
 
     def end() -> None:
         if stop.is_set():  # Ctrl-C once more
             raise KeyboardInterrupt
         stop.set()
 
-    try:
-        with on_ctrl_c(end):
-            yield from _answers(question, paths, partial(_in_processes, question, processes, stop))
-    finally:
-        get_reusable_executor().shutdown(kill_workers=stop.is_set())  # else joblib keeps them, in this folder, for whoever calls next
+    from joblib import effective_n_jobs
+
+    tasks = [(number, path, question) for number, path in enumerate(paths)]
+    processes = min(effective_n_jobs(jobs), len(paths))
+    with on_ctrl_c(end):
+        for answer in workers.answers(_solved_in_worker, tasks, processes, stop.is_set, question.overdue, OVERDUE):
+            yield question.lost(answer, paths[answer.number]) if isinstance(answer, workers.Lost) else answer
 
 
 def _on_cluster(question: Question, paths: Sequence[str], address: str, jobs: int | None, stop: Stop) -> Generator[Answer]:
@@ -223,37 +277,6 @@ def _answers(question: Question, paths: Sequence[str], attempt: Callable[[list[T
         yield from attempt([task], again)
         for _ in again:
             yield question.failed(*task, SolverError(KILLED))
-
-
-def _in_processes(question: Question, jobs: int, stop: Stop, tasks: list[Task], killed: list[Task]) -> Iterator[Answer]:
-    """An attempt with joblib. Where a process is killed, joblib gives up all that is under way; the rest goes on in new processes.
-
-    Other processes do not heed Ctrl-C but while they search; the file tells them.
-    """
-    from joblib import Parallel, delayed
-
-    waiting = dict(tasks)
-    while waiting and not stop.is_set():
-        begun: list[int] = []
-        work = (delayed(question.answer)(*task, None, stop.is_set) for task in _noted([*waiting.items()], begun, stop))
-        parallel = Parallel(min(jobs, max(2, len(waiting))), batch_size=1, pre_dispatch="n_jobs", return_as="generator_unordered")
-        try:
-            with on_ctrl_c(None) if jobs > 1 else contextlib.nullcontext():
-                answers = parallel(work)
-            for answer in answers:
-                del waiting[answer.number]
-                yield answer
-        except BrokenExecutor:
-            killed += [(number, waiting.pop(number)) for number in begun if number in waiting]
-
-
-def _noted(tasks: Iterable[Task], begun: list[int], stop: Stop) -> Iterator[Task]:
-    """The tasks until it is to stop, while it is written down which were begun."""
-    for task in tasks:
-        if stop.is_set():
-            return
-        begun.append(task[0])
-        yield task
 
 
 def _on_workers(question: Question, client: Client, most: int, tasks: list[Task], killed: list[Task]) -> Iterator[Answer]:
@@ -301,7 +324,20 @@ def _on_worker(question: Question, number: int, path: str, trace: Trace) -> Answ
 
     worker = get_worker()
     task = worker.state.tasks[worker.get_current_task()]
-    return question.answer(number, path, trace, lambda: task.state == "cancelled")
+
+    def given_up() -> bool:
+        return bool(task.state == "cancelled")
+
+    if question.limit is None and question.memory is None:
+        return question.answer(number, path, trace, given_up)
+    # Other traces may be under way in this process, which cannot be ended with one that does not heed its limits.
+    work = [(number, path, question, trace)]
+    answer: Answer | workers.Lost = next(workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, OVERDUE))
+    return question.lost(answer, path) if isinstance(answer, workers.Lost) else answer
+
+
+def _solved_for_cluster(number: int, path: str, question: Question, trace: Trace, given_up: Callable[[], bool]) -> Answer:
+    return question.answer(number, path, trace, given_up)
 
 
 def _forget_memory() -> None:
@@ -326,7 +362,13 @@ def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, redirect_stdout=False) as progress:
         task = progress.add_task("traces", total=total)
-        if sys.stdout.isatty():  # both are seen: the line goes above the bar
-            yield partial(console.out, highlight=False), partial(progress.advance, task)
-        else:
-            yield partial(print, flush=True), partial(progress.advance, task)
+
+        def say(line: str) -> None:
+            """Print a line as it is where the bar was, which moves below it: rich would fit it to the width of the terminal."""
+            progress.live.transient = True
+            progress.stop()
+            print(line, flush=True)
+            progress.live.transient = False
+            progress.start()
+
+        yield (say if sys.stdout.isatty() else partial(print, flush=True)), partial(progress.advance, task)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import Any
 
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.text import counted
-from ssh_abduction.errors import MapError
-from ssh_abduction.judge.checker import check
+from ssh_abduction.errors import MapError, printable
+from ssh_abduction.judge.checker import check, unchecked
+from ssh_abduction.judge.claims import false_claims
 from ssh_abduction.judge.proof import check_bound
-from ssh_abduction.maps import maps_of, read_json
+from ssh_abduction.maps import SSHMap, maps_of, read_json
 from ssh_abduction.steps.certificate import RESTS_ON
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
@@ -46,8 +48,13 @@ def run(options: argparse.Namespace) -> int:
         broken += bool(violations)
         for v in violations:
             steps = f"{'step' if len(v.steps) == 1 else 'steps'} {', '.join(map(str, v.steps))}: " if v.steps else ""
-            print(f"map {i + 1}: {v.axiom}: {steps}{v.message}")
-    print(f"{len(maps) - broken} of {len(maps)} maps satisfy the {len(theory.resolve(trace).axioms)} axioms")
+            print(f"map {i + 1}: {v.axiom}: {steps}{printable(v.message)}")
+    resolved = theory.resolve(trace)
+    not_checked = unchecked(resolved)
+    checked = sum(name not in not_checked for name in resolved.axioms)
+    print(f"{len(maps) - broken} of {len(maps)} maps satisfy the {checked} axioms")
+    if not_checked:
+        print(f"not checked, as they are a user's own: {printable(', '.join(not_checked))}")
     if not options.bound:
         return EXIT_VIOLATED if broken else 0
     doubt = None
@@ -57,22 +64,27 @@ def run(options: argparse.Namespace) -> int:
         doubt = "the file does not say of which theory"
     elif theory.resolve(trace).replace(prefer=()) != solved.resolve(trace).replace(prefer=()):
         doubt = "the file is of another theory"
-    proven = _bound(trace, data, theory, min((len(m.dstates) for m in maps), default=None), doubt)
+    proven = _bound(trace, data, theory, maps, doubt, (solved or theory).resolve(trace))
     return EXIT_VIOLATED if broken or not proven else 0
 
 
-def _bound(trace: Trace, data: Any, theory: Theory, fewest: int | None, doubt: str | None) -> bool:
-    """Print what the certificate of the file proves. Says whether it holds.
+def _bound(trace: Trace, data: Any, theory: Theory, maps: Sequence[SSHMap], doubt: str | None, solved: Theory) -> bool:
+    """Print what the certificate of the file proves, and what the file says wrongly of itself. Says whether all of it holds.
 
-    doubt  why clingo's verdict cannot be taken for one on this trace and theory, if so
+    doubt   why clingo's verdict cannot be taken for one on this trace and theory, if so
+    solved  the theory that the file is of
     """
+    fewest = min((len(m.dstates) for m in maps), default=None)
     if RESTS_ON - set(theory.axioms):
         raise MapError("bound: expected a theory with the axioms functional_view and deterministic, which the proof rests on")
     if not isinstance(data, dict) or "certificate" not in data:
         raise MapError("certificate: expected one beside the maps, got none; use what solve --json printed")
     bound = check_bound(trace, data["certificate"])
     for fault in bound.faults:
-        print(f"bound: {fault}")
+        print(f"bound: {printable(fault)}")
+    false = false_claims(data, maps, len(trace), solved, bound.dstates + len(bound.refuted))
+    for claim in false:
+        print(printable(claim))
     if bound.faults:
         return False
     pairs = bound.dstates * (bound.dstates - 1) // 2
@@ -87,4 +99,4 @@ def _bound(trace: Trace, data: Any, theory: Theory, fewest: int | None, doubt: s
     if fewest is not None:
         beyond = "fewer than that, so this bound or a map is wrong" if fewest < total else f"{fewest - total} more than proven"
         print(f"the maps have {fewest}" + (": no map has fewer" if fewest == total else f", {beyond}"))
-    return fewest is None or fewest >= total
+    return not false and (fewest is None or fewest >= total)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
-from ssh_abduction.cli.options import Verbs, add_output, picture_file, seed, write
+from ssh_abduction.cli.options import Verbs, add_output, check_picture, picture_file, seed, write
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.errors import SSHError
 from ssh_abduction.trace import Trace
@@ -32,6 +33,7 @@ def run(options: argparse.Namespace) -> int:
     from perception.reciprocal import ReciprocalTransformer
     from perception.views import ViewClusterer, labels_by_k
 
+    check_picture(options.plot)
     trace = Trace.load(options.trace)
     images = ReciprocalTransformer().fit_transform(images_of(trace))
     try:
@@ -58,6 +60,7 @@ def run(options: argparse.Namespace) -> int:
     chosen = table(["k", "M", *(["U"] if uncertainty else []), ""], rows)
     write(clustered, options.output, f"{chosen}\n{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}")
     if options.plot:
+        sys.stdout.flush()  # a picture that fails loses nothing of this
         from ssh_abduction.reproduce.figures import draw_quality
 
         draw_quality(options.plot, clusterer.quality_, uncertainty, clusterer.k_)

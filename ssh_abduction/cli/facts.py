@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
 from ssh_abduction.asp.facts import program
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.errors import printable
 from ssh_abduction.trace import Trace
 
 
@@ -19,5 +21,8 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     trace = Trace.load(options.trace)
-    print(program(trace, theory_of(options).resolve(trace)), end="")
+    text = program(trace, theory_of(options).resolve(trace))
+    if sys.stdout.isatty():  # clingo takes a name as it is; a terminal would obey some characters
+        text = "".join(f"{printable(line)}\n" for line in text.rstrip("\n").split("\n"))
+    print(text, end="")
     return 0

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.errors import MapError
+from ssh_abduction.errors import MapError, named
 from ssh_abduction.theory.theory import CHOICES, COUNTS, PRESETS, Theory
 from ssh_abduction.trace import Trace
 
@@ -22,29 +23,39 @@ def add_theory(parser: argparse.ArgumentParser, default: str = "topological, or 
     group.add_argument("--theory", choices=PRESETS, help=f"preset (default: {default})")
     for name, values in CHOICES.items():
         group.add_argument(f"--{name.replace('_', '-')}", choices=values)
-    for name, text in (
-        ("symmetric_sides", "a turn says four side relations rather than one"),
-        ("next_place", "a travel leads to the next place of its path"),
-        ("all_on_paths", "every dstate is along a path"),
-    ):
-        group.add_argument(f"--{name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=text)
+    said = dict(re.findall(r"^ +(\w+)  +(.+)$", Theory.__doc__ or "", re.MULTILINE))
+    for field in fields(Theory):
+        if isinstance(field.default, bool):
+            group.add_argument(f"--{field.name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=said.get(field.name))
     group.add_argument("--prefer", metavar="COUNTS", help=f"what to minimise, first to last, of {', '.join(COUNTS)}; commas between")
     group.add_argument("--without", metavar="AXIOMS", help="leave these axioms out; commas between")
+    group.add_argument(
+        "--rules", action="append", metavar="FILE", help="rules of your own, over the predicates of the encodings; may be given again"
+    )
+    for name, text in (("same", "are one dstate"), ("different", "are different dstates"), ("elsewhere", "are at different places")):
+        group.add_argument(f"--{name}", action="append", metavar="I,J", help=f"steps I and J {text}; may be given again")
 
 
 def add_output(parser: argparse.ArgumentParser) -> None:
     """Add -o TRACE."""
-    parser.add_argument("-o", "--output", required=True, metavar="TRACE", help="trace file to write, or - for standard output")
+    parser.add_argument("-o", "--output", type=output, required=True, metavar="TRACE", help="trace file to write, or - for standard output")
 
 
-def write(trace: Trace, output: str, said: str) -> None:
+def write(trace: Trace, target: str, said: str) -> None:
     """Write a trace where add_output says, and what is said of it: beside it, where the trace goes to standard output."""
-    if output == "-":
+    if target == "-":
         sys.stdout.writelines(line + "\n" for line in trace.to_lines())
         print(said, file=sys.stderr)
     else:
-        trace.save(output)
-        print(f"{said} in {output}")
+        trace.save(target)
+        print(f"{said} in {named(target)}")
+
+
+def output(text: str) -> str:
+    """A file or folder to write."""
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError(f"expected the name of a file or folder, got {text!r}; name one")
+    return text
 
 
 def seed(text: str) -> int:
@@ -59,6 +70,15 @@ def picture_file(text: str) -> str:
     if Path(text).suffix.lower() not in (".png", ".pdf", ".svg"):
         raise argparse.ArgumentTypeError(f"expected a name that ends in .png, .pdf or .svg, got {text!r}")
     return text
+
+
+def check_picture(file: str | None) -> None:
+    """Whether a picture that is asked for could be drawn, before hours of work. Raises SSHError."""
+    if file is None:
+        return
+    from ssh_abduction.reproduce.figures import require_matplotlib
+
+    require_matplotlib()
 
 
 def check_number(number: int | None, maps: Sequence[object], where: str) -> None:

@@ -6,10 +6,13 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.options import Verbs, output
 from ssh_abduction.cli.text import table
-from ssh_abduction.errors import SSHError
+from ssh_abduction.errors import SSHError, brief, named
+
+MOST_SEEDS = 10_000  # a seed takes seconds: more are surely a slip of the hand, and would fill the memory before the first is run
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -20,7 +23,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("--json", action="store_true", help="print each claim, the paper's figure and ours by seed, as JSON")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
     parser.add_argument("--outcomes", action=argparse.BooleanOptionalAction, default=True, help="map outcomes over notch and spread")
-    parser.add_argument("-o", "--output", metavar="FOLDER", help="folder to write (default: out/EXPERIMENT)")
+    parser.add_argument("-o", "--output", type=output, metavar="FOLDER", help="folder to write (default: out/EXPERIMENT)")
     parser.set_defaults(run=run)
 
 
@@ -28,7 +31,7 @@ def run(options: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from ssh_abduction.reproduce.report import reproduce, spread_of, steps
+    from ssh_abduction.reproduce.report import reproduce, steps
 
     seeds = _seeds(options.seeds)
     if options.jobs == 0:
@@ -37,24 +40,34 @@ def run(options: argparse.Namespace) -> int:
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as progress:
         task = progress.add_task(options.experiment, total=steps(options.experiment, seeds, options.outcomes))
-        rows = reproduce(
+
+        def show(rows: list[dict[str, Any]]) -> None:
+            progress.stop()  # so that the bar is not drawn into the table
+            _print(options, rows)
+            progress.start()
+
+        reproduce(
             options.experiment,
             seeds,
             folder,
             options.jobs,
             options.outcomes,
             on_done=lambda what: progress.update(task, advance=1, description=f"{options.experiment}: {what}"),
+            on_table=show,
         )
-    if options.json:
-        print(json.dumps({"experiment": options.experiment, "claims": rows}, ensure_ascii=False, indent=1))
-    else:
-        print(
-            table(
-                ["claim", "paper", "here", "holds"], [[r["claim"], r["paper"], spread_of(r), f"{r['holds']} of {r['seeds']}"] for r in rows]
-            )
-        )
-        print(f"\nThe page with the figures is {folder / 'report.html'}")
+    if not options.json:
+        print(f"\nThe page with the figures is {named(folder / 'report.html')}")
     return 0
+
+
+def _print(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
+    from ssh_abduction.reproduce.report import spread_of
+
+    if options.json:
+        print(json.dumps({"experiment": options.experiment, "claims": rows}, ensure_ascii=False, indent=1), flush=True)
+        return
+    cells = [[r["claim"], r["paper"], spread_of(r), f"{r['holds']} of {r['seeds']}"] for r in rows]
+    print(table(["claim", "paper", "here", "holds"], cells), flush=True)
 
 
 def _seeds(text: str) -> list[int]:
@@ -63,7 +76,12 @@ def _seeds(text: str) -> list[int]:
         found: list[int] = []
         for part in text.split(","):
             first, _, last = part.partition("-")
-            found += range(int(first), int(last or first) + 1)
-    except ValueError:
-        raise SSHError(f"--seeds: expected numbers as 0-19 or 1,5,7, got {text!r}") from None
+            numbers = range(int(first), int(last or first) + 1)
+            if not numbers or numbers[-1] >= 2**32 or len(found) + len(numbers) > MOST_SEEDS:
+                raise ValueError
+            found += numbers
+    except (ValueError, OverflowError):
+        raise SSHError(
+            f"--seeds: expected numbers as 0-19 or 1,5,7, at most {MOST_SEEDS:,} and below {2**32:,}, got {brief(text)}"
+        ) from None
     return found

@@ -6,6 +6,7 @@ import argparse
 
 from ssh_abduction.cli.options import Verbs, add_output, seed, write
 from ssh_abduction.cli.text import counted
+from ssh_abduction.errors import printable
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -29,5 +30,5 @@ def run(options: argparse.Namespace) -> int:
 
     world = World.named(options.world).with_choices(options.start, options.route, options.reach)
     trace = simulate(world, options.tours, options.seed, stars=not options.no_stars, every=options.every)
-    write(trace, options.output, f"{counted(len(trace), 'images')} of {world.name}")
+    write(trace, options.output, f"{counted(len(trace), 'images')} of {printable(world.name)}")
     return 0

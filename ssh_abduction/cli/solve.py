@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
-import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
-from itertools import islice
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
+from ssh_abduction.asp.control import Grounding
+from ssh_abduction.asp.limits import Stop
+from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, on_ctrl_c, opening, warn, warnings_of
 from ssh_abduction.cli.text import describe, differences, headline
-from ssh_abduction.explain import Explanation, Interrupted, explain
+from ssh_abduction.explain import Explanation
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.solver.search import Progress, Search, Solution, Status
+from ssh_abduction.solver.result import Progress, Solution, Status
+from ssh_abduction.solver.search import Search
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 from ssh_abduction.trace import Trace
 
-EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}
 SHOWN = 4  # maps compared on the terminal; --json has all
 
 
@@ -58,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
         return batch.run(options)
     trace = Trace.load(options.traces[0])
     with contextlib.ExitStack() as until_printed:
-        with _progress(trace) as on_progress:
+        with _progress(trace, options.json) as on_progress:
             search = Search(
                 trace,
                 theory_of(options),
@@ -69,128 +70,118 @@ def run(options: argparse.Namespace) -> int:
                 on_progress=on_progress,
             )
             until_printed.enter_context(on_ctrl_c(search.interrupt))  # half of what is printed would be worth nothing
-            kept = _print_json(search) if options.json else list(_first(search, SHOWN))
-            explanation = explained(search)
-        solution = search.solution(tuple(kept))
-        if options.json:
-            _print_end(search, solution, explanation)
-        else:
-            _print_text(search, solution, explanation)
+            printed = (_Json if options.json else _Text)(search)
+            guard = Guard(search.interrupt, printed.last_words, options.time_limit, options.memory_limit)
+            until_printed.enter_context(guard)
+            explanation = printed.searched(guard.say)
+        solution = search.solution(tuple(printed.kept))
+        guard.say(partial(printed.end, solution, explanation))
+        warn(warnings_of(search, solution))
     return exit_code(solution)
 
 
-def exit_code(solution: Solution) -> int:
-    """What the shell is told of a solution."""
-    return 130 if solution.stopped == "interrupted" else EXIT_CODES[solution.status]
+class _Text:
+    """What is printed of a search for people.
+
+    kept  the first maps; the others are counted and let go
+    """
+
+    def __init__(self, search: Search) -> None:
+        self.kept: list[SSHMap] = []
+        self._search = search
+
+    def searched(self, _: Callable[[Callable[[], str]], None]) -> Explanation | None:
+        """Search, and explain why there is no map, if that is so."""
+        for ssh_map in self._search:
+            if len(self.kept) < SHOWN:
+                self.kept.append(ssh_map)
+        return explained(self._search)
+
+    def end(self, solution: Solution, explanation: Explanation | None) -> str:
+        """All that is to be printed."""
+        return "".join(f"{line}\n" for line in _lines(self._search, solution, explanation))
+
+    def last_words(self, why: Stop) -> tuple[str, int]:
+        """What is known, where the search cannot be ended in time, and the exit code."""
+        solution = self._search.snapshot(why)
+        kept = tuple(self.kept) if solution.status is Status.OPTIMAL and self.kept else solution.maps
+        warn(warnings_of(self._search, solution))
+        return self.end(replace(solution, maps=kept), None), exit_code(solution)
 
 
-def explained(search: Search) -> Explanation | None:
-    """Why there is no map, if that is so and there is time to find out."""
-    if search.status is not Status.UNSATISFIABLE:
-        return None
-    try:
-        return explain(search.trace, search.theory, search.over)
-    except Interrupted:
-        return None
+class _Json:
+    """What is printed of a search for programs: the maps, one a line, as they come; none is kept."""
+
+    kept: tuple[SSHMap, ...] = ()
+
+    def __init__(self, search: Search) -> None:
+        self._search = search
+        self._maps = 0  # that were printed
+        self._begun = False
+
+    def searched(self, say: Callable[[Callable[[], str]], None]) -> Explanation | None:
+        """Print the maps as they are found, and explain why there is none, if that is so."""
+        say(self._opening)
+        for ssh_map in self._search:
+            say(partial(self._line, ssh_map))
+        return explained(self._search)
+
+    def end(self, solution: Solution, explanation: Explanation | None, grounding: Grounding | None = None) -> str:
+        """What comes after the maps."""
+        return "\n]," + dump(ending(self._search, solution, explanation, self._maps, grounding or self._search.grounding))[1:] + "\n"
+
+    def last_words(self, why: Stop) -> tuple[str, int]:
+        """What is missing, with what is known, where the search cannot be ended in time, and the exit code."""
+        solution = self._search.snapshot(why)
+        warn(warnings_of(self._search, solution))
+        words = "" if self._begun else self._opening()
+        if not self._maps and solution.maps:
+            words += self._line(solution.maps[0])
+        return words + self.end(solution, None, Grounding(0, 0)), exit_code(solution)  # clingo is not asked while another thread is in it
+
+    def _opening(self) -> str:
+        self._begun = True
+        return dump(opening(self._search))[:-1] + ', "maps": ['
+
+    def _line(self, ssh_map: SSHMap) -> str:
+        self._maps += 1
+        return ("," if self._maps > 1 else "") + "\n" + dump(ssh_map.to_dict())
 
 
-def _first(search: Search, most: int) -> Iterator[SSHMap]:
-    """The first maps; the others are counted and let go."""
-    maps = iter(search)
-    yield from islice(maps, most)
-    for _ in maps:
-        pass
-
-
-def _print_json(search: Search) -> list[SSHMap]:
-    """The maps, one a line, as they come; none is kept."""
-    sys.stdout.write(dump(opening(search))[:-1] + ', "maps": [')
-    for i, ssh_map in enumerate(search):
-        sys.stdout.write(("," if i else "") + "\n" + dump(ssh_map.to_dict()))
-    sys.stdout.write("\n]")
-    return []
-
-
-def _print_end(search: Search, solution: Solution, explanation: Explanation | None) -> None:
-    print("," + dump(ending(search, solution, explanation))[1:])
-
-
-def opening(search: Search) -> dict[str, Any]:
-    """What the JSON of a solution says before its maps."""
-    return {"theory": search.theory.to_dict(), "steps": len(search.trace)}
-
-
-def ending(search: Search, solution: Solution, explanation: Explanation | None) -> dict[str, Any]:
-    """What the JSON of a solution says after its maps."""
-    end: dict[str, Any] = {
-        "status": solution.status.value,
-        "complete": solution.complete,
-        "count": search.count,
-        "cost": solution.cost.to_dict() if solution.cost else None,
-        "bound": solution.bound.to_dict(),
-        "prefix": solution.prefix,
-        "grounding": asdict(search.grounding),
-        "seconds": {k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")},
-    }
-    if solution.certificate:
-        end["certificate"] = solution.certificate.to_dict(search.trace)
-    if solution.stopped:
-        end["stopped"] = solution.stopped
-    if solution.partial:
-        end["partial"] = solution.partial.to_dict()
-    if explanation:
-        end["explanation"] = explanation.to_dict()
-    return end
-
-
-def dump(value: dict[str, Any]) -> str:
-    """JSON on one line."""
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)
-
-
-def _print_text(search: Search, solution: Solution, explanation: Explanation | None) -> None:
-    print(headline(solution, search.count, explanation))
+def _lines(search: Search, solution: Solution, explanation: Explanation | None) -> Iterator[str]:
+    yield headline(solution, search.count, explanation)
     if solution.status is Status.UNSATISFIABLE:
         if explanation:
             first, last = search.trace.at(explanation.first), search.trace.at(explanation.last)
-            print(f"look at what was seen and done from {first} to {last}, or leave one of these axioms out: --without NAME")
+            yield f"look at what was seen and done from {first} to {last}, or leave one of these axioms out: --without NAME"
         return
     if solution.cost is None:
         if solution.partial:
-            print(f"\nbest map of the first {len(solution.partial.labels)} steps\n{describe(solution.partial)}")
+            yield f"\nbest map of the first {len(solution.partial.labels)} steps\n{describe(solution.partial)}"
         return
-    print(f"\n{'map 1' if search.count > 1 else 'map'}\n{describe(solution.maps[0])}")
+    yield f"\n{'map 1' if search.count > 1 else 'map'}\n{describe(solution.maps[0])}"
     if len(solution.maps) > 1:
         some = "" if search.count <= SHOWN else f" (the first {SHOWN}; --json lists all)"
-        print(f"\nwhat tells the maps apart{some}\n{differences(solution.maps, search.trace)}")
+        yield f"\nwhat tells the maps apart{some}\n{differences(solution.maps, search.trace)}"
 
 
 @contextlib.contextmanager
-def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
-    """Ctrl-C does this, rather than stop the program wherever it is: what was found is still printed. None: nothing, nor in processes that begin."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may handle signals
-        return
-    before = signal.signal(signal.SIGINT, (lambda *_: action()) if action else signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextlib.contextmanager
-def _progress(trace: Trace) -> Iterator[Any]:
-    """A line on stderr, while solving, if stderr is a terminal."""
-    if not sys.stderr.isatty():
+def _progress(trace: Trace, prints_meanwhile: bool) -> Iterator[Any]:
+    """A line on stderr, while solving, if stderr is a terminal, unless it would come between the lines that are printed meanwhile."""
+    if not sys.stderr.isatty() or (prints_meanwhile and sys.stdout.isatty()):
         yield None
         return
     from rich.console import Console
+    from rich.live import Live
+    from rich.spinner import Spinner
 
-    with Console(stderr=True).status("solving") as status:
+    status = Spinner("dots", "solving")
+    # Unless told otherwise, rich takes over what is printed to stdout, too: it would go to stderr, fitted to the terminal's width.
+    with Live(status, console=Console(stderr=True), transient=True, redirect_stdout=False, redirect_stderr=False):
 
         def show(p: Progress) -> None:
             best = f"best {p.cost.dstates} dstates, {p.cost.places} places, {p.cost.paths} paths" if p.cost else "no map yet"
             bound = ", ".join(f"{k} ≥ {v}" for k, v in p.bound.to_dict().items()) or "no bound yet"
-            status.update(f"prefix {p.prefix} of {len(trace)} steps; {best}; {bound}; {p.maps} maps; {p.seconds:.1f} s")
+            status.update(text=f"prefix {p.prefix} of {len(trace)} steps; {best}; {bound}; {p.maps} maps; {p.seconds:.1f} s")
 
         yield show

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ssh_abduction.errors import printable
 from ssh_abduction.explain import Explanation
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.solver.search import Solution, Status
+from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.trace import Trace
 
 
@@ -33,15 +34,10 @@ def counted(number: int, things: str) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Columns aligned under a head."""
-    cells = [[*head], *([_printable(str(cell)) for cell in row] for row in rows)]
+    """Columns aligned under a head. What would break the table, or steer the terminal, is escaped."""
+    cells = [[*head], *([printable(str(cell)) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     return "\n".join("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells)
-
-
-def _printable(text: str) -> str:
-    """A text without what would break the table or steer the terminal."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def describe(ssh_map: SSHMap) -> str:

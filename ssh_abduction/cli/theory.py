@@ -18,7 +18,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     print("presets: on, or stars (on where the trace has stars), or –")
-    for level in encodings.LEVELS:
+    for level in encodings.levels():
         print(f"\n{level}")
         rows = [
             [axiom.name, *(_state(axiom.name, preset) for preset in PRESETS), axiom.sentence, f"[{axiom.source}]"]

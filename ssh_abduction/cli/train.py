@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from typing import Any
 
-from ssh_abduction.cli.options import Verbs, check_number, picture_file, seed
+from ssh_abduction.cli.options import Verbs, check_number, check_picture, output, picture_file, seed
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.errors import MapError
+from ssh_abduction.errors import MapError, named
 from ssh_abduction.maps import maps_of, read_json
 from ssh_abduction.trace import Trace
 
@@ -16,7 +17,7 @@ from ssh_abduction.trace import Trace
 def add_parser(verbs: Verbs) -> None:
     text = "Train a nearest-neighbour recogniser on the labels that a map gives to the images of a trace."
     train = verbs.add_parser("train", help="train a recogniser on a map's labels", description=text)
-    train.add_argument("-o", "--output", required=True, metavar="FILE.skops", help="file to write")
+    train.add_argument("-o", "--output", type=output, required=True, metavar="FILE.skops", help="file to write")
     train.set_defaults(run=run_train)
     text = "Recognition rate by 10-fold cross-validation, against the number of images, on the labels that a map gives."
     evaluate = verbs.add_parser("evaluate", help="learning curve of a recogniser", description=text)
@@ -65,13 +66,14 @@ def run_train(options: argparse.Namespace) -> int:
 
     images, labels = _labelled(options)
     save(recogniser().fit(images, labels), options.output)
-    print(f"{counted(len(set(labels.tolist())), 'dstates')} learnt from {counted(len(images), 'images')} in {options.output}")
+    print(f"{counted(len(set(labels.tolist())), 'dstates')} learnt from {counted(len(images), 'images')} in {named(options.output)}")
     return 0
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
     from perception.recognition import learning_curve
 
+    check_picture(options.plot)
     images, labels = _labelled(options)
     sizes = sorted({len(images) * tenth // 10 for tenth in range(1, 11)} - {0})
     curve = learning_curve(images, labels, sizes, folds=options.folds, random_state=options.seed)
@@ -85,6 +87,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
         ]
         print(table(["images", "recognised", "worst fold", "best fold"], rows))
     if options.plot:
+        sys.stdout.flush()  # a picture that fails loses nothing of this
         from ssh_abduction.reproduce.figures import draw_learning
 
         draw_learning(options.plot, {"map": curve})
@@ -92,12 +95,16 @@ def run_evaluate(options: argparse.Namespace) -> int:
 
 
 def run_recognise(options: argparse.Namespace) -> int:
+    from perception.errors import PerceptionError
     from perception.images import images_of
     from perception.store import load
 
-    model = load(options.recogniser).model
-    trace = Trace.load(options.trace)
-    labels = [int(x) for x in model.predict(images_of(trace))]
+    stored = load(options.recogniser)
+    images = images_of(Trace.load(options.trace))
+    try:
+        labels = stored.labels(images)
+    except PerceptionError as error:
+        raise PerceptionError(f"{options.recogniser}: {error}") from None
     if options.json:
         print(json.dumps(labels))
     else:

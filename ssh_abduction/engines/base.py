@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
-import clingo
-
-from ssh_abduction.asp import facts
-from ssh_abduction.asp.asking import Asker, Watch, has_processors
+from ssh_abduction.asp.control import Asker, has_processors
+from ssh_abduction.asp.limits import Watch
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.steps.log import Log
-from ssh_abduction.theory import encodings
+from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
@@ -112,63 +109,12 @@ class Engine(Asker):
         """All maps of the prefix that cost this and no more; or `enough` of them, unless that is 0."""
         raise NotImplementedError
 
+    def forbid(self, equalities: Collection[Equality]) -> None:
+        """From now on no map has all of these equalities, of steps of the prefix."""
+        raise NotImplementedError
+
     def settle(self) -> None:
         """End what is still under way in clingo, when a search is over: a thread left behind would abort Python at its end."""
-
-
-class StepEngine(Engine):
-    """The encodings of all levels: a dstate is named by the first step at it."""
-
-    def __init__(self, trace: Trace, theory: Theory, watch: Watch, paths: int) -> None:
-        super().__init__(trace, theory, watch, paths)
-        self._asked: int | None = None  # the step that is the last one, as far as clingo knows
-        for name in facts.encoding_names(theory):
-            self._control.load(encodings.path(name))
-        self._control.add("base", [], facts.theory_facts(theory, paths))
-
-    def with_paths(self, paths: int) -> StepEngine:
-        engine = StepEngine(self._trace, self._theory, self._watch, paths)
-        engine.ground_seconds, engine.solve_seconds = self.ground_seconds, self.solve_seconds
-        return engine
-
-    def over(self, trace: Trace, watch: Watch, log: Log) -> StepEngine:
-        self._trace, self._watch = trace, watch
-        self.ground_seconds = self.solve_seconds = 0.0
-        return self
-
-    def grow(self, size: int) -> None:
-        began = time.perf_counter()
-        control = self._control
-        try:
-            base: list[tuple[str, list[clingo.Symbol]]] = [] if self.size else [("base", [])]
-            while self.size < size:
-                self._watch.check()
-                part = f"steps_from_{self.size}"
-                stop = min(size, self.size + (8 if self.size < 32 else 1))
-                control.add(part, [], facts.trace_facts(self._trace, self._theory, self.size, stop))
-                control.ground([*base, (part, []), *(("step", facts.numbers(t)) for t in range(self.size, stop))])
-                self.size, base = stop, []
-            if self._asked != size - 1:
-                control.ground([("check", facts.numbers(size - 1))])
-                if self._asked is not None:
-                    control.release_external(facts.query(self._asked))
-                control.assign_external(facts.query(size - 1), True)
-                self._asked = size - 1
-        finally:
-            self.ground_seconds += time.perf_counter() - began
-
-    def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
-        if most:
-            configuration: Any = self._control.configuration
-            configuration.solver.opt_strategy = "usc"  # as a good map is known, what is missing is a bound
-        return self._answers(self._read, *((",".join(["opt", *map(str, most)]), 0) if self._theory.priorities else ("ignore", 1)))
-
-    def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        bound = ",".join(map(str, cost))
-        return self._answers(self._read, f"enum,{bound}" if bound else "ignore", 0)
-
-    def _read(self, model: clingo.Model) -> Found:
-        return Found(facts.read_map(model, self._trace, self._theory), tuple(model.cost))
 
 
 class ChartedEngine(Engine):

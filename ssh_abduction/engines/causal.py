@@ -1,8 +1,9 @@
 """An engine for the causal theory on long traces: the dstates have names before clingo is asked.
 
-As many steps as are pairwise apart (`apart.py`) are pinned to names of their own. That bounds the number of dstates from below, leaves no
-two ways to name these dstates, and lets every other step choose only among the names that it is not apart from. A view has a few
-spare names, at the cost of one dstate each, and a *rest*, which stands for all dstates of the view beyond them.
+As many steps as are pairwise apart (`steps/apart.py`) are pinned to names of their own. That bounds the number of dstates from below,
+leaves no two ways to name these dstates, and lets every other step choose only among the names that it is not apart from. A view has a few
+spare names, at the cost of one dstate each, and a *rest*, which stands for all dstates of the view beyond them. There may be several
+largest cliques; the one that is pinned has steps that are apart from most others, so that the other steps have the fewest names left.
 
 *Claim.* A map of minimal cost that uses no rest is a minimal map, and its cost is the minimum.
 *Proof.* Name the dstates of any map: those of the pinned steps as pinned, the others by spare names of their view as far as these
@@ -16,19 +17,25 @@ answer soon, what is missing is rather more knowledge than less, and all links a
 of them are apart, where more than one action shows it: no two of these are at one name. The links say so, too, but only once it is
 chosen where they lead.
 
-Raising the bound by cores stalls when what is missing can be spread over many views: every core is then about all of them. After
-CORES conflicts the numbers of dstates are asked for one by one instead, from the bound up: is there an answer that costs no more? If
-there is none, the bound is one higher. The first answer without a rest is a minimal map, as it costs what the bound is; the same
-search then goes on with the other maps.
+clasp raises the bound core by core: a core is a set of spare names that cannot all be left unused. Cores are small at first, as the names
+of a view are its own: what different corners of the world need adds up. Raising the bound by cores stalls when what is missing can be
+spread over many views: every core is then about all of them. After CORES conflicts the numbers of dstates are asked for one by one instead,
+from the bound up: is there an answer that costs no more? If there is none, the bound is one higher. The first answer without a rest is a
+minimal map, as it costs what the bound is; the same search then goes on with the other maps.
 
 Of a long trace, whose steps are too many to be compared in pairs, as many are taken as it takes for the clique to be as large as that of all; and what
 conflicts ask for is given a thousand links at a time.
 
-Beside all that small maps are sought in a thread of its own. First steps are merged by evidence (`merging.py`), so that a limit leaves a map that is
-not bad; then a map is guessed, of places with frames where the trace lets itself be taken for one of these (`annealing.py`), and smaller ones are
-sought near it (`nearby.py`). Of a long trace the beginning is guessed, and what comes of that followed along the rest (`following.py`). Whatever bound
-meets these maps ends the search. Where there is but one processor, steps are merged at once, and the guess waits until raising the bound by cores has
-stalled. Where there is no such search, clasp has the second processor: two threads, which tell each other what they learn.
+Beside all that small maps are sought in a thread of its own. First steps are merged by evidence (`guesses/merging.py`), so that a limit
+leaves a map that is not bad; then a map is guessed, of places with frames where the trace lets itself be taken for one of these
+(`guesses/annealing.py`), and smaller ones are sought near it (`engines/nearby.py`). Of a long trace the beginning is guessed, and what
+comes of that followed along the rest (`guesses/continuing.py`). Whatever bound meets these maps ends the search. Where there is but one
+processor, steps are merged at once, and the guess waits until raising the bound by cores has stalled. Where there is no such search, clasp
+has the second processor: two threads, which tell each other what they learn. Which minimal maps come first may then differ from run to run;
+all of them are the same.
+
+To read an answer takes Python longer than clingo takes to find it. So an answer is asked only for the atoms that it may hold: where actions
+lead, from which the step after each step follows. While a map is made of one answer, clingo searches for the next.
 """
 
 from __future__ import annotations
@@ -42,12 +49,13 @@ import clingo
 import numpy as np
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.asking import POLL, Stopped, Watch, give_threads, new_control
+from ssh_abduction.asp.control import give_threads, new_control
+from ssh_abduction.asp.limits import POLL, Stopped, Watch
 from ssh_abduction.engines.base import AT_ONCE, ChartedEngine, Found
 from ssh_abduction.engines.nearby import AT_A_TIME, SECONDS_A_CHARACTER, Beside, NearbySearch, mended
 from ssh_abduction.guesses.annealing import annealed, annealed_steps
+from ssh_abduction.guesses.continuing import followed
 from ssh_abduction.guesses.merging import merged, merged_near, thinned
-from ssh_abduction.guesses.tree import followed
 from ssh_abduction.steps.apart import Continuations, Matrix
 from ssh_abduction.steps.chart import Chart, Link, NoFrame, numbered
 from ssh_abduction.steps.log import Log
@@ -146,8 +154,14 @@ class NamedEngine(ChartedEngine):
         return dict.fromkeys(self._chart.seen, SPARES)
 
     def _far(self, node: int) -> Matrix:
-        """Which nodes are apart from this one, as more than one action shows."""
-        return self._chart.continuations.apart_from(node, actions=2)
+        """Which nodes are apart from this one, as more than one action shows, or as evidence says."""
+        continuations = self._chart.continuations
+        return continuations.apart_from(node, actions=2) if self._speedups.apart else continuations.excluded_from(node)
+
+    @property
+    def _tells_far(self) -> bool:
+        """Whether clingo is told which nodes are apart."""
+        return self._speedups.apart or bool(self._chart.excluded)
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         for labels in self._better_labels():
@@ -164,8 +178,9 @@ class NamedEngine(ChartedEngine):
             return
         try:
             for labels in self._searched():
-                self._known = labels
-                yield labels
+                if not self._chart.excluded or self._chart.is_map(labels):
+                    self._known = labels
+                    yield labels
         except Settled:
             self._end_beside()
             yield self._known or []
@@ -253,7 +268,7 @@ class NamedEngine(ChartedEngine):
             chart=self._chart,
             clique=self.clique,
             may_be=self._may_be,
-            far=self._far if self._speedups.apart else None,
+            far=self._far if self._tells_far else None,
             configuration="tweety",
         )
 
@@ -339,8 +354,10 @@ class NamedEngine(ChartedEngine):
             self._beside = None
 
     def _heed(self, labels: list[int] | None, bound: int) -> None:
-        """Take what the search near a guess knows."""
-        self._known, self.bound = labels, max(self.bound or 0, bound)
+        """Take what the search near a guess knows. What it merged need not heed what evidence excludes."""
+        if labels is None or not self._chart.excluded or self._chart.is_map(labels):
+            self._known = labels
+        self.bound = max(self.bound or 0, bound)
 
     def _ask_one_by_one(self) -> None:
         self._one_by_one = True
@@ -518,7 +535,7 @@ class NamedEngine(ChartedEngine):
                 given.append((t, view, self._choices[t], self._last.get(view)))
                 if len(self._choices[t]) > 1:
                     self._last[view] = t
-                    far += [(t, int(u)) for u in np.flatnonzero(self._far(t) & self._open)] if self._speedups.apart else []
+                    far += [(t, int(u)) for u in np.flatnonzero(self._far(t) & self._open)] if self._tells_far else []
                     self._open[t] = True
         self._links.update(dict.fromkeys(added))
         part, batch = f"batch_{self._batches}", self._batches
@@ -570,6 +587,9 @@ class NamedEngine(ChartedEngine):
             elif here >= 0 and labels[u] >= 0 and goes.setdefault(key, labels[u]) != labels[u]:
                 failed.update(self._not_given((link, followed[t])))
                 failed.update(self._not_given(followed[u]))
+        excluded = {node for pair in self._chart.excluded if labels[pair[0]] == labels[pair[1]] >= 0 for node in pair}
+        if excluded:
+            failed.update((link, None) for link in self._chart.links if link not in self._links and not excluded.isdisjoint(link[::2]))
         return labels, list(failed)
 
     def _not_given(self, trail: _Trail) -> Iterator[tuple[Link, None]]:

@@ -1,8 +1,9 @@
 """An engine for the full theory where places have frames and fewest dstates come first: dstates first, then places and paths.
 
-Frames tell so much that the dstates are all but settled before any place or path is: a turn rotates by known quarters, so whole visits
-are the same or not (`chart.py`). Which ones are is asked of same.lp (`same.py`), which knows the causal axioms and how turns rotate,
-but not the order of places on a path, or its sides. For what that leaves of the dstates, streets.lp finds the fewest paths and places.
+Frames tell so much that the dstates are all but settled before any place or path is: a turn rotates by known quarters, so whole visits are
+the same or not (`steps/chart.py`). Which ones are is asked of same.lp (`engines/visits.py`), which knows the causal axioms and how turns
+rotate, but not the order of places on a path, or its sides. For what that leaves of the dstates, streets.lp finds the fewest paths and
+places.
 
 *Claim.* Cut to which visits are at one place, a map of the full theory is an answer of same.lp. So the fewest dstates of the latter are
 a lower bound, and if some answer of that cost has streets, all minimal maps are among the answers of that cost with their least streets.
@@ -10,10 +11,17 @@ a lower bound, and if some answer of that cost has streets, all minimal maps are
 that are one. If no single street does, or visits are too many for that, streets.lp is asked which labels clash: smallest sets of nodes at
 dstates that no streets fit; same.lp is told that these do not go together. As every map of the full theory keeps that, bounds still hold.
 
-*Beside.* What takes long is guessed in another process, and the guess made a map (`streets.py`). Near it, maps are made here, while there it is
-proven with names, from the guess outwards, how many dstates the causal axioms need (`nearby.py`). Where a map has so few, it has the fewest;
-and the same names then list all ways to be at so few. Some of them fit no frame, which streets.lp sees, or have no streets; but each map of the
-full theory is among them.
+*Beside.* What takes long is guessed in another process, and the guess made a map (`engines/streets.py`). Near it, maps are made here, while
+there it is proven with names, from the guess outwards, how many dstates the causal axioms need (`engines/nearby.py`). Where a map has so
+few, it has the fewest; and the same names then list all ways to be at so few. Some of them fit no frame, which streets.lp sees, or have no
+streets; but each map of the full theory is among them.
+
+*Which street.* In a world half explored the causal axioms allow fewer dstates than order and sides do, in thousands of ways: to forbid
+these one by one does not end. What sides.lp says of a single street takes a rule for each two visits that may be one, so it is said only of
+streets that an answer contradicts.
+
+*Listing.* Most of the time of a long list would go into reading answers. So an answer is asked for the atoms that it may hold, those of the
+last answer first, and clingo searches for the next one while a map is made of it.
 """
 
 from __future__ import annotations
@@ -27,7 +35,8 @@ from itertools import chain, combinations, islice
 import clingo
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.asking import Watch, give_threads, mapped
+from ssh_abduction.asp.control import give_threads, mapped
+from ssh_abduction.asp.limits import Watch
 from ssh_abduction.asp.process import in_process
 from ssh_abduction.engines.base import Found
 from ssh_abduction.engines.nearby import Beside, NearbySearch
@@ -100,7 +109,7 @@ class FramedEngine(SameEngine):
 
     @property
     def _streets(self) -> Streets:
-        return Streets(self._trace, self._theory, pinned=self._speedups.clique)
+        return Streets(self._trace, self._theory, pinned=self._speedups.clique, check=self._watch.check)
 
     def grow(self, size: int) -> None:
         if size != self.size:
@@ -445,4 +454,4 @@ class FramedEngine(SameEngine):
         control = self._streets.telling(chart, nodes, nodes)
         self._watch.check()
         _, elsewhere, _ = next(self._answers(facts.read_told, "ignore", 1, control=control))
-        return replace(chart, elsewhere=elsewhere)
+        return chart.with_elsewhere(elsewhere)

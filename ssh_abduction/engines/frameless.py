@@ -1,18 +1,19 @@
 """An engine for the full theory where places have no frames and fewest dstates come first: dstates first, then places and paths.
 
-The axioms of places and paths for each step of a trace are too much for clingo after some dozen steps that keep exploring. But they speak of
-dstates: of which place one is at, and which path it is along. So the dstates have names, as in the causal theory (`named.py`), and ways.lp says
-what order and sides demand of where the actions at them lead. That depends on how many dstates there are, not on how many steps.
+The axioms of places and paths for each step of a trace are too much for clingo after some dozen steps that keep exploring. But they speak
+of dstates: of which place one is at, and which path it is along. So the dstates have names, as in the causal theory (`engines/causal.py`),
+and ways.lp says what order and sides demand of where the actions at them lead. That depends on how many dstates there are, not on how many
+steps.
 
 *Claim.* Each map of the full theory is an answer of names.lp and ways.lp, at the cost that it has in the causal theory.
 *Proof.* Let `goes` hold of the links of the map, and of no others; let each atom of ways.lp hold where what its comment says is so in the map.
 Then its rules are what the axioms say of two or three dstates: a travel keeps the path, and leads on along it, as the order is transitive;
-a turn keeps the place. The rest (`named.py`) is no dstate of theirs. ∎
+a turn keeps the place. The rest (`engines/causal.py`) is no dstate of theirs. ∎
 
 So the bounds hold, and if some answer of that cost has places and paths, all minimal maps are among the answers of that cost with the least
 of them. courses.lp tells, and finds the least. If an answer has none, the path of some dstate mostly shows it: ways.lp is told some of
 these paths at a time; a dozen are mostly enough. What no single path shows is forbidden: as few of the answer's links as have
-no places and paths.
+no places and paths. All labels with the fewest dstates have to be seen for that, which takes most of the time where there are hundreds.
 """
 
 from __future__ import annotations
@@ -21,15 +22,18 @@ import time
 from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from itertools import chain, islice
 from typing import TypeAlias
 
 import clingo
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.asking import Control, Watch, mapped
+from ssh_abduction.asp.control import Control, mapped
+from ssh_abduction.asp.limits import Watch
 from ssh_abduction.engines.base import Found
 from ssh_abduction.engines.causal import NamedEngine, Settled
+from ssh_abduction.engines.streets import PREPARING
 from ssh_abduction.engines.visits import smaller
 from ssh_abduction.steps.chart import Link, numbered
 from ssh_abduction.steps.log import Log
@@ -41,7 +45,29 @@ from ssh_abduction.trace import Trace
 CONTRARY = 8  # paths that clingo is told of in one go
 BETTERING = 20_000  # conflicts after which better courses are no longer sought one after another
 
+_Far: TypeAlias = tuple[int, int, int, int]  # two dstates that are not at one place, and two steps at them of which evidence says so
 _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...]]  # labels of all steps, and options of clasp
+
+
+@dataclass(frozen=True)
+class _Members:
+    """What no places and paths may fit: links, and dstates that are far from each other."""
+
+    links: list[Link]
+    far: list[_Far]
+
+    @classmethod
+    def of(cls, members: Iterable[Link | _Far]) -> _Members:
+        links, far = list[Link](), list[_Far]()
+        for member in members:
+            if len(member) == 3:
+                links.append(member)
+            else:
+                far.append(member)
+        return cls(links, far)
+
+    def all(self) -> list[Link | _Far]:
+        return [*self.links, *self.far]
 
 
 class WaysEngine(NamedEngine):
@@ -169,16 +195,28 @@ class WaysEngine(NamedEngine):
         if new := [name for name in contrary if name not in self._ways][:CONTRARY]:
             self._tell_of(new)
             return
-        rule = facts.forbidden_links(smaller(links, self._clashing))
+        clash = smaller(_Members([*links], self._far_away(labels)).all(), self._clashing)
+        members = _Members.of(clash)
+        placed = {end for far in members.far for end in ((far[2], far[0]), (far[3], far[1]))}
+        steps = {step for step, _ in placed}
+        self._add(link for link in self._chart.links if link not in self._links and not steps.isdisjoint(link[::2]))
+        rule = facts.forbidden_links(members.links, placed)
         self._end_begun()
         self._forbidden += 1
         self._control.add(f"forbidden_{self._forbidden}", [], rule)
         self._control.ground([(f"forbidden_{self._forbidden}", [])])
 
-    def _clashing(self, links: list[Link]) -> list[Link] | None:
-        """These links, if no places and paths fit them."""
-        found = any(self._has_courses(self._courses(links, single=single)) for single in (True, False))
-        return None if found else links
+    def _clashing(self, members: list[Link | _Far]) -> list[Link | _Far] | None:
+        """These links, and dstates that are far from each other, if no places and paths fit them."""
+        some = _Members.of(members)
+        found = any(self._has_courses(self._courses(some.links, far=some.far, single=single)) for single in (True, False))
+        return None if found else members
+
+    def _far_away(self, labels: Sequence[int]) -> list[_Far]:
+        """The dstates that are not at one place, as evidence says of steps at them; each pair once."""
+        away = self._log.pairs.elsewhere.items()
+        found = {(labels[i], labels[t]): (i, t) for t, others in away if t < len(labels) for i in others}
+        return [(*dstates, *steps) for dstates, steps in found.items()]
 
     def _links_of(self, labels: Sequence[int]) -> list[Link]:
         """The links that these labels of all steps make, each once."""
@@ -190,15 +228,16 @@ class WaysEngine(NamedEngine):
         dstates: Iterable[int] = (),
         options: Sequence[str] = (),
         *,
+        far: Collection[_Far] = (),
         single: bool = False,
         parts: Iterable[str] = ("base", "least"),
     ) -> clingo.Control:
         """A control for the places and paths of dstates that are linked so, and of these."""
-        control = Control(options)
+        control = Control(options, self._watch.check, PREPARING)
         control.load(encodings.path("courses"))
         control.load(encodings.path("preference"))
-        dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links)))
-        control.add("base", [], facts.course_facts(self._theory, dstates, links, self._actions, single=single))
+        dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links), *(f[:2] for f in far)))
+        control.add("base", [], facts.course_facts(self._theory, dstates, links, self._actions, [f[:2] for f in far], single=single))
         control.ground([(part, []) for part in parts])
         return control
 
@@ -207,7 +246,7 @@ class WaysEngine(NamedEngine):
         key = tuple(labels), tuple(options)
         if self._asked is None or self._asked[0] != key:
             began = time.perf_counter()
-            control = self._courses(self._links_of(labels), labels, options)
+            control = self._courses(self._links_of(labels), labels, options, far=self._far_away(labels))
             self._watch.check()
             self.ground_seconds += time.perf_counter() - began
             self._asked = key, control

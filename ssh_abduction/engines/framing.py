@@ -1,16 +1,18 @@
 """Maps of theories that do not ask for frames, found as if places had them.
 
-Where places have frames, dstates are all but settled before any place or path is (`framed.py`): traces of thousands of steps have good maps in
-seconds. In other theories clingo is given all axioms for each step, and comes to a few dozen steps of a world that keeps looking new. But each map of
-`Theory.with_frames` is one of theirs, so where the world has frames, its map is found, or one about as small; and it is minimal where it costs no
-more than what is proven of a prefix.
+Where places have frames, dstates are all but settled before any place or path is (`engines/framed.py`): traces of thousands of steps have
+good maps in seconds. In other theories clingo is given all axioms for each step, and comes to a few dozen steps of a world that keeps
+looking new. But each map of `Theory.with_frames` is one of theirs, so where the world has frames, its map is found, or one about as small;
+and it is minimal where it costs no more than what is proven of a prefix.
+
+Where a trace has no stars, what is seen all around follows from what turns showed, if it does; that takes the place of stars.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from ssh_abduction.asp.asking import Watch
+from ssh_abduction.asp.limits import Watch
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.steps.chart import Chart, NoFrame
@@ -32,7 +34,7 @@ def maps_with_frames(trace: Trace, theory: Theory, watch: Watch, speedups: Speed
     if theory.star == "none":
         trace = trace.without_stars()
         around = _around(trace, Log(trace, theory))
-    engine = FramedEngine(trace, framed, watch, Log(trace, framed), speedups, around, soon=0.0)
+    engine = FramedEngine(trace, framed, watch, Log(trace, framed), speedups.that_hold_for(framed), around, soon=0.0)
     try:
         engine.grow(len(trace))
         for found in engine.improving_maps():

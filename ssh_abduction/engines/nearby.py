@@ -5,18 +5,23 @@ dstate be spared: if that cannot be, clingo tells which steps are in the way (a 
 are free to change, until some steps can move or it is shown that the dstate is needed. Where that is left open, all steps of some part of the
 map are free at once, of parts as large as can be settled soon (large neighbourhood search: Shaw 1998).
 
-When each dstate is needed, nothing is assumed any more of where steps are, but still how many names each view has: no more than in the known map.
-Then views are allowed more names, one after the other, and in the end any number of dstates (the rest, see `named.py`). Each time clingo is
-asked for a map of fewer dstates in all.
+When each dstate is needed, nothing is assumed any more of where steps are, but still how many names each view has: no more than in the
+known map. Then views are allowed more names, one after the other, and in the end any number of dstates (the rest, see `engines/causal.py`).
+Each time clingo is asked for a map of fewer dstates in all.
 
 *Claim.* If there is none when everything is allowed, the known map is minimal.
-*Proof.* What is asked then is what `named.py` asks, at a cost of one less: by the claim there, each map of so few dstates is an answer. ∎
+*Proof.* What is asked then is what `engines/causal.py` asks, at a cost of one less: by the claim there, each map of so few dstates is an
+answer. ∎
 
 To allow everything at once is to ask for a proof that may take hours; what clingo learns from each question makes the next one short. So names
 are allowed one, two, four at a time, as long as that goes well.
 
-The nodes need not be the steps of a trace: where places have frames, they are those of `Chart.framed`, and rotations are links as actions are.
-What is found then need not fit a frame, as names.lp does not know how rotations compose; but the bound holds.
+The nodes need not be the steps of a trace: where places have frames, they are those of `Chart.framed`, and rotations are links as actions
+are. What is found then need not fit a frame, as names.lp does not know how rotations compose; but the bound holds. Names are poor at
+raising that bound core by core, which is why `engines/visits.py` has none, but good at this.
+
+In the causal theory clasp searches as its configuration `tweety` does, which proves several times as soon what its default proves; where
+places have frames its default is better, above all to list answers.
 """
 
 from __future__ import annotations
@@ -33,7 +38,8 @@ import clingo
 import numpy as np
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.asking import Asker, Stopped, Watch, give_threads, has_processors, new_control
+from ssh_abduction.asp.control import Asker, give_threads, has_processors, new_control
+from ssh_abduction.asp.limits import Stopped, Watch
 from ssh_abduction.steps.apart import Matrix
 from ssh_abduction.steps.chart import Chart, numbered
 from ssh_abduction.theory.speedups import Speedups

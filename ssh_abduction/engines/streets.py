@@ -1,10 +1,22 @@
 """Questions to streets.lp: what order and sides say of the dstates of a trace whose places have frames, and which guesses they let be maps.
 
-What takes a choice of places and paths is asked by an engine, under its limits (`framed.py`). What is asked here takes none, or hardly any: so little
-time that some conflicts are limit enough.
+What takes a choice of places and paths is asked by an engine, under its limits (`engines/framed.py`). What is asked here takes none, or
+hardly any: so little time that some conflicts are limit enough.
 
-*A guess.* Visits are annealed (`annealing.py`). Where the guess cannot be right its places are let free, and what is there is merged by evidence
-(`merging.py`), while streets.lp says which visits cannot be one, and which have to be, and which merge leads to no streets: so a guess becomes a map.
+*A guess.* Visits are annealed (`guesses/annealing.py`). Where the guess cannot be right its places are let free, and what is there is
+merged by evidence (`guesses/merging.py`), while streets.lp says which visits cannot be one, and which have to be, and which merge leads to
+no streets: so a guess becomes a map.
+
+*Taken back.* Where what is known by then has no streets, the first merge that shows it is found by bisection, and the two classes that it
+made one are apart from then on. Where the guess itself has no streets, its places are taken in order, those visited once first and then
+those visited most; the first place with which there are no streets is left out of the guess, a few at most. Where a guess leads to no map,
+another one follows, with more spare names for places: places that fall together where names are short do not come apart later.
+
+*Single streets.* To see that dstates have streets at all, no two places that turns do not join, and no two stretches of a path, are taken
+for one unless they have to be. That takes a small part of the time that it takes to ground all ways to merge them.
+
+*Pinned.* For the fewest paths, stretches no two of which can be one path are paths of their own, and the other stretches choose among these
+first.
 """
 
 from __future__ import annotations
@@ -19,7 +31,8 @@ import clingo
 import numpy as np
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.asking import Control, Watch
+from ssh_abduction.asp.control import Control
+from ssh_abduction.asp.limits import Watch
 from ssh_abduction.guesses.annealing import MORE, SECONDS, attempts
 from ssh_abduction.guesses.merging import Told, first_failing, kept, merged_as_told, merged_near
 from ssh_abduction.steps.apart import Matrix, large_clique
@@ -33,6 +46,10 @@ FIRST_PAIRS = 200_000  # visits that may be one, of the beginning that is guesse
 LOST = 0.05  # of all visits, at most, if the beginning says where they are
 TRYING = 500  # conflicts after which it is left open whether there are single streets
 LEFT_OUT = 3  # places, at most, without which a guess has streets
+PREPARING = (
+    1.6,
+    2.1,
+)  # of the time and of the memory that grounding all streets or courses took, clasp takes so much, about, before it can be stopped
 LOOSENED = 2  # so many travels, less one, from where a guess cannot be right its places are let free
 
 
@@ -40,16 +57,25 @@ class Streets:
     """The axioms of places and paths, for charts of one trace.
 
     pinned  whether stretches no two of which can be one path are named as paths beforehand
+    check   called now and then while clingo grounds; may raise. A process that is sent these questions has its own, so this does not go along
     """
 
-    def __init__(self, trace: Trace, theory: Theory, *, pinned: bool = True) -> None:
+    def __init__(self, trace: Trace, theory: Theory, *, pinned: bool = True, check: Callable[[], None] = lambda: None) -> None:
         self._trace = trace
         self._theory = theory
         self._pinned = pinned
+        self._check = check
+
+    def __reduce__(self) -> tuple[Callable[..., Streets], tuple[Trace, Theory]]:
+        return partial(Streets, pinned=self._pinned), (self._trace, self._theory)
+
+    def _under(self, check: Callable[[], None]) -> Streets:
+        """The same questions, which these limits end."""
+        return Streets(self._trace, self._theory, pinned=self._pinned, check=check)
 
     def control(self, chart: FramedChart, options: Sequence[str] = ()) -> clingo.Control:
         """A control with these axioms, and what happened; nothing is grounded yet."""
-        control = Control(options)
+        control = Control(options, self._check, PREPARING)
         control.load(encodings.path("streets"))
         control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
         return control
@@ -107,20 +133,21 @@ class Streets:
 
         Of a long trace the beginning is guessed, and the rest as that says; where that is no map, twice as many visits, and so on.
         """
+        asked = self._under(watch.check)
         visits = chart.visits_with(FIRST_PAIRS)
         while visits < len(chart.stars) and chart.fitting[-1] > 2 * chart.fitting[visits]:
             part = chart.beginning(visits)
-            if labels := self._continued(chart, part, self._guessed(part, watch.check), watch.check):
+            if labels := asked._continued(chart, part, asked._guessed(part, watch.check), watch.check):
                 return labels
             visits *= 2
-        return self._guessed(chart, watch.check)
+        return asked._guessed(chart, watch.check)
 
     def _guessed(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
         """The same, of visits that are guessed in one go."""
         began = time.thread_time()  # a thread may be made to wait
         apart = chart.apart()
         found: list[list[int]] = []
-        for _, guess in attempts(replace(chart, elsewhere=()), check):
+        for _, guess in attempts(replace(chart, elsewhere=chart.away), check):
             starts = [guess.loosened(chart, travels).labels(chart) for travels in range(LOOSENED)]
             maps = [(merged_near(apart, chart.links, start, check), start) for start in starts]
             ranked = sorted(maps, key=lambda pair: len(set(pair[0])))

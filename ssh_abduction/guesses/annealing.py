@@ -17,8 +17,8 @@ the last draw counts, and the visits before and after the stretch: forward filte
 for hidden Markov models"). Stars, and which visits are apart from pinned ones, rule states out from the start. That a travel can be
 made back is not an axiom, but counts as if it had been seen.
 
-Names of places are as in `named.py`: visits that are pairwise apart are places of their own, and each kind of place has spare names.
-There have to be many: places that fall together where names are short do not come apart later.
+Names of places are as in `engines/causal.py`: visits that are pairwise apart are places of their own, and each kind of place has spare
+names. There have to be many: places that fall together where names are short do not come apart later.
 
 A causal trace of other actions than turns and travels is annealed in the same way: each step is a visit, to a place at which the robot stands in one way.
 """

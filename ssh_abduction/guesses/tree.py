@@ -1,143 +1,288 @@
-"""Where the steps of a long trace are, by a map of its beginning: also where that map lacks links.
+"""A consistent map without a search: each step leads somewhere new, unless the axioms say where.
 
->>> from ssh_abduction import Theory, Trace
->>> from ssh_abduction.guesses.tree import followed
->>> from ssh_abduction.steps.log import Log
->>> trace = Trace.from_steps("abcabcacabcbcabc", ["go"] * 6 + ["back"] + ["go"] * 3 + ["back"] + ["go"] * 4)
->>> followed(Log(trace, Theory.causal()), [0, 1, 2, 0])
-[0, 1, 2, 0, 1, 2, 0, 2, 0, 1, 2, 1, 2, 0, 1, 2]
+>>> from ssh_abduction import Action, Step, Theory
+>>> from ssh_abduction.guesses.tree import Sketch
+>>> sketch = Sketch(Step("end"), Theory(star="none"))
+>>> travel, around = Action("travel", "travel"), Action("around", "turn", "around")
+>>> [sketch.extend(action, Step(view)) for action, view in [(travel, "hall"), (around, "hall"), (travel, "end"), (around, "end")]]
+[True, True, True, True]
+>>> sketch.map().labels
+(0, 1, 2, 3, 0)
 
-The trace is walked along the links of the map. Where the map does not say where an action leads, that is one of the dstates that show what is seen then: the
-one that predicts the steps from there on longest, if it is ahead of all others and not contradicted soon. Where that is not clear the robot is lost, until
-what it sees and does tells where it is: Markov localisation, with beliefs that are all or nothing. What one walk does not settle the next one may, as more of the map is known by
-then. In the end a link that none has settled leads to a new dstate.
+A sketch is a tree of streets. A travel goes to a new place, or back to the place that it came from along the same street; so two
+streets share one place at most, and what lies ahead on a branch lies on no street that the branch leaves: the axioms of the order and
+of the sides hold. Within a place the axioms of turns, courses and headings decide what is equal.
 
-So a link may be wrong, and so may be the map. Then the trace contradicts it sooner or later, and the dstate where it does is forgotten, or more of those before it where
-that does not help. What comes of that has more dstates than it needs, some of which are one (`merging.thinned`).
+Where the way back looks otherwise than remembered, the travel goes to a new place. Where something remembered as known is later
+contradicted, the sketch is given up; one without `homing`, that never takes a place for one seen before unless next_place asks
+for it, may still do.
+
+Where the theory asks for no frames, a sketch may still have them: that adds axioms, and leaves none out.
+
+A sketch may also begin with a map of some steps, and grow like a tree beyond it. What is new then lies on new streets, or on one known street, and
+contradicts nothing either. But a turn can be the first to show how two known streets cross, which then has to fit all their places; and without frames,
+a dstate that a turn leads to itself lies on no street: whether that fits, the sketch does not say.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import TypeAlias
+from dataclasses import dataclass, field, replace
 
-from ssh_abduction.steps.log import Log
-
-LOOKED = 300  # steps ahead, at most, that are looked at to tell where the robot is
-SETTLED = 10  # steps that a dstate has to predict for a link to lead there,
-FOUND = 20  # and where the robot is lost for it to be there,
-AHEAD = 2  # and so many more than any other
-WALKS = 100  # after which the map is given up; after half of them the robot is lost no more: what is not settled by then is new
-MANY = 10  # times as many dstates as it had, with which it is given up, too
-
-_Link: TypeAlias = tuple[int, int]  # dstate, action
+from ssh_abduction.maps import DState, Path, SSHMap
+from ssh_abduction.steps.chart import QUARTERS
+from ssh_abduction.steps.log import observation
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Action, Step, Trace, View
 
 
-def followed(log: Log, labels: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int] | None:
-    """Labels of all steps of a trace, of a map near that of its first steps; None where too much of that is contradicted.
+class _Contradiction(Exception):  # noqa: N818 - not an error
+    """The axioms ask for what was not seen."""
 
-    labels  of a map of the first steps, numbered from 0
-    check   called now and then; may raise
+
+@dataclass(slots=True)
+class _State:
+    """A dstate, and what is known of it so far."""
+
+    view: View
+    seen: object
+    place: int
+    heading: int
+    path: int | None = None
+    direction: int = 1
+    reverse: list[int] = field(default_factory=list)  # the dstates that a turn around links it to
+
+
+class Sketch:
+    """A map of the steps so far, which grows with each.
+
+    homing   whether a travel may go back to where it came from, though next_place does not ask for it
+    framed   whether places have frames, though the theory does not ask for them: most turns then lead to what is known
+    certain  whether the map is known to be consistent; if not, it is to be checked, and this to be set
     """
-    known = _Map(log, labels, check)
-    patient, furthest, back = True, 0, 1
-    for walk in range(WALKS):
-        links = len(known.leads)
-        found = known.walked(lost=patient)
-        if known.is_too_large:
+
+    def __init__(self, first: Step, theory: Theory, homing: bool = True, framed: bool = False) -> None:
+        self.labels: list[int] = []
+        self._theory = theory
+        self._homing = homing or theory.next_place
+        self._framed = framed or theory.star == "frame"
+        self._states: list[_State] = []
+        self._links: dict[tuple[int, str], int] = {}
+        self._stars: list[object] = []  # of each place
+        self._orders: list[list[int]] = []  # of each path, the places as direction +1 meets them
+        self._along: dict[tuple[int, int, int], int] = {}  # place, path, direction: dstate
+        self._facing: dict[tuple[int, int], int] = {}  # place, heading: dstate, where places have frames
+        self._slots: dict[tuple[int, int], tuple[int, int]] = {}  # place, heading: path, direction, where places have frames
+        self._excused: tuple[tuple[int, int], ...] = ()  # pairs of paths
+        self._map: SSHMap | None = None
+        self._tree = self.certain = True
+        self.labels.append(self._new_place(first))
+        if theory.all_on_paths and theory.level == "topological":
+            self._find_course(0)
+
+    @classmethod
+    def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
+        """Sketches of a trace that begins so, those first that become smaller if they are not given up."""
+        framed = [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
+        return [cls(first, theory, homing, frames) for frames in framed for homing in (True, False)]
+
+    @classmethod
+    def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Sketch:
+        """A sketch that begins with a map of a trace, of a theory with all its axioms."""
+        sketch = cls(trace.steps[0], theory)
+        sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.labels)
+        sketch._links = {(s, action): x for s, action, x in ssh_map.links}
+        sketch._excused = ssh_map.excused
+        sketch._orders = [list(path.order) for path in ssh_map.paths]
+        sketch._states, sketch._along, sketch._facing, sketch._slots = [], {}, {}, {}
+        stars: dict[int, object] = {}
+        seen = dict(zip(reversed(ssh_map.labels), reversed(trace.steps), strict=True))
+        for s in ssh_map.dstates:
+            place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
+            sketch._states.append(_State(s.view, observation(seen[s.id], theory), place, heading, s.path, direction))
+            stars.setdefault(place, sketch._star(seen[s.id], heading))
+            if s.path is not None:
+                sketch._along[place, s.path, direction] = s.id
+            if sketch._framed:
+                sketch._facing[place, heading] = s.id
+            if sketch._framed and s.path is not None:
+                sketch._slots[place, heading] = s.path, direction
+                sketch._slots[place, (heading + 2) % 4] = s.path, -direction
+        sketch._stars = [stars[place] for place in sorted(stars)]
+        turns = {action.name: action.turn for action in trace.actions}
+        for here, action, there in ssh_map.links:
+            if turns[action] == "around":
+                sketch._states[here].reverse.append(there)
+                sketch._states[there].reverse.append(here)
+        return sketch
+
+    def extend(self, action: Action, step: Step) -> bool:
+        """Go on with an action and what was seen then. False where that contradicts the sketch, which is of no use from then on."""
+        here = self.labels[-1]
+        there = self._links.get((here, action.name))
+        try:
+            if there is None:
+                there = self._links[here, action.name] = self._untried(here, action, step)
+                self._map = None
+            self._must_show(there, step)
+        except _Contradiction:
+            return False
+        self.labels.append(there)
+        return True
+
+    def map(self) -> SSHMap:
+        """The sketch as a map of all steps so far, numbered by first visit."""
+        labels = tuple(self.labels)
+        self._map = replace(self._map, labels=labels) if self._map else self._made(labels)
+        return self._map
+
+    def _untried(self, here: int, action: Action, step: Step) -> int:
+        """Where an action leads that was never tried in a dstate."""
+        if self._theory.level == "causal":
+            return self._new(step, 0, 0)
+        if action.kind == "travel":
+            return self._travel(here, step)
+        return self._turn(here, action, step)
+
+    def _turn(self, here: int, action: Action, step: Step) -> int:
+        s = self._states[here]
+        around = action.turn == "around"
+        heading = (s.heading + QUARTERS[action.turn]) % 4
+        there: int | None = None
+        if self._framed:
+            there = self._facing.get((s.place, heading))
+        elif around and s.path is not None:
+            there = self._along.get((s.place, s.path, -s.direction))
+        elif around:
+            there = next((x for x in s.reverse if self._states[x].seen == observation(step, self._theory)), None)
+        if there is None:
+            there = self._new(step, s.place, heading)
+        if around:
+            self._turned_around(here, there)
+        elif s.path is not None and self._states[there].path is not None:
+            self._doubt()
+        if self._theory.all_on_paths:
+            self._find_course(there)
+        return there
+
+    def _turned_around(self, here: int, there: int) -> None:
+        """A turn around links two dstates: what one's course is, the other's is in reverse."""
+        self._states[here].reverse.append(there)
+        self._states[there].reverse.append(here)
+        for s in (self._states[here], self._states[there]):
+            if s.path is not None:
+                self._doubt()
+                for x in s.reverse:
+                    self._set_course(x, s.path, -s.direction)
+
+    def _travel(self, here: int, step: Step) -> int:
+        path, direction = self._find_course(here)
+        place, order = self._states[here].place, self._orders[path]
+        position = order.index(place)
+        if self._homing and 0 <= position + direction < len(order):
+            there = self._known_ahead(order[position + direction], path, direction, step)
+            if there is not None:
+                return there
+            if self._theory.next_place:
+                raise _Contradiction
+        there = self._new_place(step)
+        order.insert(position + (direction == 1), self._states[there].place)
+        self._set_course(there, path, direction)
+        return there
+
+    def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
+        """The dstate at a place on the path that a travel would end at, if what is seen fits."""
+        there = self._along.get((place, path, direction))
+        heading = 0
+        if there is None and self._framed:
+            heading = next(k for k in range(4) if self._slots.get((place, k)) == (path, direction))
+            there = self._facing.get((place, heading))
+        if there is None:
+            if self._star(step, heading) != self._stars[place]:
+                return None
+            there = self._new(step, place, heading)
+        elif self._states[there].seen != observation(step, self._theory):
             return None
-        if len(found) < len(log.seen):
-            furthest, back = max(furthest, len(found)), 2 * back if len(found) <= furthest else 1
-            known.forget(found[-back:])
-        elif -1 not in found:
-            return found
-        elif len(known.leads) == links or walk > WALKS // 2:
-            patient = False
-    return None
+        else:
+            self._doubt()
+        self._set_course(there, path, direction)
+        return there
 
+    def _find_course(self, here: int) -> tuple[int, int]:
+        """The path and direction of a dstate; where it has none, the one that leaves through its slot, or a new path."""
+        s = self._states[here]
+        if s.path is None:
+            path, direction = self._slots.get((s.place, s.heading), (len(self._orders), 1))  # without frames there are no slots
+            if path < len(self._orders) or not self._framed:
+                self._doubt()
+            if path == len(self._orders):
+                self._orders.append([s.place])
+            self._set_course(here, path, direction)
+            return path, direction
+        return s.path, s.direction
 
-class _Map:
-    """A map of the first steps, to which links are added, and dstates.
+    def _doubt(self) -> None:
+        """What was done may be the first to join two streets that the map knew."""
+        self.certain = self._tree
 
-    leads  where actions lead, by dstate and action
-    """
+    def _set_course(self, here: int, path: int, direction: int) -> None:
+        """Give a dstate its course, and in reverse those that a turn around links it to."""
+        s = self._states[here]
+        if (s.path, s.direction) == (path, direction):
+            return
+        if s.path is not None or self._along.setdefault((s.place, path, direction), here) != here:
+            raise _Contradiction
+        s.path, s.direction = path, direction
+        if self._framed:
+            self._slots[s.place, s.heading] = path, direction
+            self._slots[s.place, (s.heading + 2) % 4] = path, -direction
+        for x in s.reverse:
+            self._set_course(x, path, -direction)
 
-    def __init__(self, log: Log, labels: Sequence[int], check: Callable[[], None]) -> None:
-        self._check = check
-        self._seen, self._actions = log.seen, log.actions
-        self._shows = dict(zip(labels, log.seen, strict=False))  # what is seen at each dstate
-        self.leads = {(labels[t], log.actions[t]): labels[t + 1] for t in range(len(labels) - 1)}
-        self._start: int | None = labels[0]
-        self._most = MANY * len(self._shows)
-        self._like: dict[int, list[int]] = {}  # the dstates where something is seen
-        for dstate, seen in self._shows.items():
-            self._like.setdefault(seen, []).append(dstate)
+    def _new_place(self, step: Step) -> int:
+        """A dstate at a new place."""
+        self._stars.append(self._star(step, 0))
+        return self._new(step, len(self._stars) - 1, 0)
 
-    @property
-    def is_too_large(self) -> bool:
-        return len(self._shows) > self._most
+    def _new(self, step: Step, place: int, heading: int) -> int:
+        """A new dstate at a place."""
+        assert step.view is not None
+        if self._star(step, heading) != self._stars[place]:
+            raise _Contradiction
+        self._states.append(_State(step.view, observation(step, self._theory), place, heading))
+        if self._framed:
+            self._facing[place, heading] = len(self._states) - 1
+        return len(self._states) - 1
 
-    def walked(self, *, lost: bool) -> list[int]:
-        """Labels of the steps, -1 where the robot is lost, if it may be; those before the first one that contradicts the map. Links that are clear on the way are added."""
-        labels: list[int] = []
-        for t, seen in enumerate(self._seen):
-            link = (labels[-1], self._actions[t - 1]) if t and labels[-1] >= 0 else None
-            there = self.leads.get(link) if link else None if t else self._start
-            if there is None:
-                there = self._predicting(t, SETTLED if link else FOUND, link)
-                if there is None and not lost:
-                    there = self._new(seen)
-                if link and there is not None:
-                    self.leads[link] = there
-            elif self._shows[there] != seen:
-                break
-            if self.is_too_large:
-                break
-            labels.append(-1 if there is None else there)
-        return labels
+    def _star(self, step: Step, heading: int) -> object:
+        """The star of a place where this is seen: in its frame, if it has one."""
+        star = step.openings if self._theory.star != "none" else None
+        if self._framed and star is not None:
+            return tuple(star[(slot - heading) % 4] for slot in range(4))
+        return observation(step, self._theory)[1]
 
-    def forget(self, dstates: Iterable[int]) -> None:
-        """Let the map know nothing of these dstates."""
-        forgotten = {dstate for dstate in dstates if dstate >= 0}
-        for dstate in forgotten:
-            self._like[self._shows[dstate]].remove(dstate)
-        self.leads = {link: there for link, there in self.leads.items() if forgotten.isdisjoint((link[0], there))}
-        if self._start in forgotten:
-            self._start = None
+    def _must_show(self, there: int, step: Step) -> None:
+        if self._states[there].seen != observation(step, self._theory):
+            raise _Contradiction
 
-    def _new(self, seen: int) -> int:
-        """A new dstate that shows this."""
-        dstate = len(self._shows)
-        self._shows[dstate] = seen
-        self._like.setdefault(seen, []).append(dstate)
-        return dstate
-
-    def _predicting(self, step: int, least: int, link: _Link | None = None) -> int | None:
-        """The dstate of a step that predicts at least so many steps from there on, and clearly more than any other; None where there is no such.
-
-        link  is taken to lead to each dstate that is tried
-        """
-        self._check()
-        best, most, next_most = None, 0, 0
-        for dstate in self._like.get(self._seen[step], ()):
-            if link:
-                self.leads[link] = dstate
-            steps, contradicted = self._predicted(dstate, step)
-            if steps > most:
-                best, most, next_most = None if contradicted else dstate, steps, most
-            else:
-                next_most = max(next_most, steps)
-        if link:
-            self.leads.pop(link, None)
-        return best if most >= min(least, len(self._seen) - step) and most >= next_most + AHEAD else None
-
-    def _predicted(self, dstate: int, step: int) -> tuple[int, bool]:
-        """How many steps a dstate predicts from this one on, itself among them, and whether what comes then contradicts it."""
-        for t in range(step + 1, min(step + LOOKED, len(self._seen))):
-            there = self.leads.get((dstate, self._actions[t - 1]))
-            if there is None:
-                return t - step, False
-            if self._shows[there] != self._seen[t]:
-                return t - step, True
-            dstate = there
-        return min(LOOKED, len(self._seen) - step), False
+    def _made(self, labels: tuple[int, ...]) -> SSHMap:
+        links = tuple(sorted((s, action, x) for (s, action), x in self._links.items()))
+        if self._theory.level == "causal":
+            return SSHMap(labels, tuple(DState(i, s.view) for i, s in enumerate(self._states)), links)
+        first: dict[int, tuple[int, int]] = {}  # of each path: its number, and the direction that is faced first
+        for s in self._states:
+            if s.path is not None:
+                first.setdefault(s.path, (len(first), s.direction))
+        dstates = tuple(
+            DState(
+                id=i,
+                view=s.view,
+                place=s.place,
+                path=None if s.path is None else first[s.path][0],
+                direction=None if s.path is None else s.direction * first[s.path][1],
+                heading=s.heading if self._theory.star == "frame" else None,
+            )
+            for i, s in enumerate(self._states)
+        )
+        paths = tuple(Path(number, tuple(self._orders[path][::direction])) for path, (number, direction) in first.items())
+        excused = [sorted((first[h][0], first[g][0])) for h, g in self._excused]
+        return SSHMap(labels, dstates, links, tuple(range(len(self._stars))), paths, tuple(sorted((h, g) for h, g in excused)))

@@ -59,7 +59,7 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
 
     Returns
     -------
-    The violations: first those of `map_explains_trace` (the map fits the trace, and its numbers fit each other), then
+    The violations of all axioms but those that `unchecked` names: first those of `map_explains_trace` (the map fits the trace, and its numbers fit each other), then
     those of the axioms in the order of the theory.
 
     Raises
@@ -72,8 +72,14 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
     """
     theory = (theory or Theory.topological()).resolve(trace)
     reading = _Reading(trace, ssh_map, theory)
-    checks = [(COHERENCE, test) for test in _COHERENCE] + [(name, AXIOMS[name]) for name in theory.axioms]
+    checks = [(COHERENCE, test) for test in _COHERENCE] + [(name, AXIOMS[name]) for name in theory.axioms if name in AXIOMS]
     return tuple(Violation(name, tuple(sorted(set(steps))), message) for name, test in checks for steps, message in test(reading))
+
+
+def unchecked(theory: Theory) -> tuple[str, ...]:
+    """What a theory asks for that the checker knows nothing of: axioms of the user's own rules, and rules without a name."""
+    named = tuple(name for name in theory.axioms if name not in AXIOMS)
+    return named + tuple(f"the rules of {rules.name}" for rules in theory.rules if not rules.axioms)
 
 
 # What the axioms speak of: the distinct observations and moves of the trace, as the map labels them.
@@ -784,6 +790,21 @@ def _path_goes_straight(m: _Reading) -> Found:
                 )
 
 
+def _asserted(m: _Reading) -> Found:
+    """What somebody says of pairs of steps is so."""
+    labels, theory = m.map.labels, m.theory
+    told = [("one dstate", theory.same), ("different dstates", theory.different), ("at different places", theory.elsewhere)]
+    for said, (i, j) in ((said, pair) for said, pairs in told for pair in pairs if max(pair) < len(labels)):
+        here, there = labels[i], labels[j]
+        places = {m.states[label].place for label in (here, there) if label in m.states}
+        if said == "one dstate" and here != there:
+            yield [i, j], f"Steps {i} and {j} are dstates {here} and {there}, but are said to be one dstate."
+        elif said != "one dstate" and here == there:
+            yield [i, j], f"Steps {i} and {j} are one dstate, {here}, but are said to be {said}."
+        elif said == "at different places" and len(places) == 1 and None not in places:
+            yield [i, j], f"Steps {i} and {j} are at one place, {min(places, key=str)}, but are said to be {said}."
+
+
 AXIOMS: dict[str, Check] = {
     "functional_view": _functional_view,
     "deterministic": _deterministic,
@@ -814,4 +835,5 @@ AXIOMS: dict[str, Check] = {
     "turn_rotates": _turn_rotates,
     "one_dstate_per_heading": _one_dstate_per_heading,
     "path_goes_straight": _path_goes_straight,
+    "asserted": _asserted,
 }

@@ -31,7 +31,8 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
     """Check the certificate of a lower bound on dstates, as `Certificate.to_dict` wrote it.
 
     Steps that the same actions lead to different views from are different dstates, as a dstate has one view and actions are
-    deterministic. So each pair of the clique is followed along the trace. Raises MapError where the certificate is malformed.
+    deterministic. So each pair of the clique is followed along the trace; where the certificate has no words at all, as far as the same was done.
+    Raises MapError where the certificate is malformed.
     """
     if not isinstance(certificate, Mapping):
         raise MapError(f"certificate: expected an object, got {brief(certificate)}; solve the trace again with --json")
@@ -43,17 +44,29 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
     if not _integers(refuted) or refuted != list(range(len(steps), len(steps) + len(refuted))):
         raise MapError(f"certificate: refuted: expected the numbers from {len(steps)} up without a gap, got {brief(refuted)}")
     word_of: dict[frozenset[int], list[str]] = {}
+    has_words = "words" in certificate
     for entry in words if isinstance(words, list) else [words]:
         if not isinstance(entry, list) or len(entry) != 3 or not _integers(entry[:2]) or not isinstance(entry[2], list):
             raise MapError(f"certificate: words: expected [step, step, [action, …]], got {brief(entry)}")
         word_of[frozenset(entry[:2])] = entry[2]
     pairs = list(combinations(steps, 2))
-    faults = [fault for i, j in pairs if (fault := _not_apart(trace, i, j, word_of.get(frozenset((i, j)), [])))]
+    told = (word_of.get(frozenset(pair), []) if has_words else _common_actions(trace, *pair) for pair in pairs)
+    faults = [fault for (i, j), word in zip(pairs, told, strict=True) if (fault := _not_apart(trace, i, j, word))]
     return ProvenBound(len(steps), tuple(refuted), tuple(faults))
 
 
 def _integers(values: Any) -> bool:
     return isinstance(values, list) and all(isinstance(value, int) and not isinstance(value, bool) for value in values)
+
+
+def _common_actions(trace: Trace, i: int, j: int) -> list[str]:
+    """What was done after both steps until the views differ, or the actions do, or the trace ends: the word, where a certificate has none."""
+    word: list[str] = []
+    for here, there in zip(trace.steps[i:], trace.steps[j:], strict=False):
+        if here.view != there.view or here.action is None or there.action is None or here.action.name != there.action.name:
+            break
+        word.append(here.action.name)
+    return word[: len(trace) - 1 - max(i, j)]
 
 
 def _not_apart(trace: Trace, i: int, j: int, word: Sequence[str]) -> str | None:

@@ -1,6 +1,8 @@
 """Maps of a trace that a robot is still driving: made of guesses, or mended, in no time or in a process of their own. For theories where places have frames.
 
-Consistent by the axioms of the theory (`framed.py`), but not minimal for sure.
+Consistent by the axioms of the theory (`engines/framed.py`), but not minimal for sure. A map that the trace contradicts is mended: dstates
+stay as far as they can, what does not fit is something new, and single streets (`engines/streets.py`) say whether that is a map. Where that
+takes longer than a step may, it is done in the other process, in which else one guess after another is made a map.
 """
 
 from __future__ import annotations
@@ -10,7 +12,8 @@ import weakref
 from collections.abc import Sequence
 from concurrent.futures import Future
 
-from ssh_abduction.asp.asking import Stopped, Watch, has_processors
+from ssh_abduction.asp.control import has_processors
+from ssh_abduction.asp.limits import Stopped, Watch
 from ssh_abduction.asp.process import in_process
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.maps import SSHMap
@@ -22,14 +25,14 @@ from ssh_abduction.trace import Step, Trace
 
 def guessed_map(trace: Trace, theory: Theory, speedups: Speedups, watch: Watch) -> SSHMap | None:
     """A map made of a guess, if one is found soon."""
-    found = FramedEngine(trace, theory, watch, Log(trace, theory), speedups).map_of_guess()
+    found = FramedEngine(trace, theory, watch, Log(trace, theory), speedups.that_hold_for(theory)).map_of_guess()
     return found.map if found else None
 
 
 def mended_map(trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None) -> SSHMap | None:
     """A map of a trace near one of its first steps that its later steps contradict, if there is one in which all that does not fit is new."""
     watch = watch or Watch()
-    found = FramedEngine(trace, theory, watch, Log(trace, theory), speedups).map_mended_from(known.labels)
+    found = FramedEngine(trace, theory, watch, Log(trace, theory), speedups.that_hold_for(theory)).map_mended_from(known.labels)
     return found.map if found else None
 
 

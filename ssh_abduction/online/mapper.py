@@ -14,25 +14,25 @@ robot is in, and shows there what is seen; CONTRADICTED, if it shows something e
 
 *Claim.* If some map of M predicts the step and none finds it unknown, the ones that predict it are all minimal maps of the longer trace.
 
-*Proof.* By (1) of the claim in `solver.py`, no map of the longer trace costs less than c. A map that predicts the step costs c, by (2).
-Conversely let F be a minimal map of the longer trace. It costs c, and, cut by the last step, is a map R of M, by (3). R does not
+*Proof.* By (1) of the claim in `solver/search.py`, no map of the longer trace costs less than c. A map that predicts the step costs c, by
+(2). Conversely let F be a minimal map of the longer trace. It costs c, and, cut by the last step, is a map R of M, by (3). R does not
 contradict the step: actions are deterministic, and a dstate has one observation, by functional_view and the axioms of the stars
-(`replay.observation` takes the star as these read it, so another rotation of a pattern is no contradiction). So R predicts the
-step, and F is the replayed R, by (3). ∎
+(`log.observation` takes the star as these read it, so another rotation of a pattern is no contradiction). So R predicts the step, and F is
+the replayed R, by (3). ∎
 
 Else clingo is asked, in the one control that is kept: for all maps of cost c if some map of M predicts the step, else for the minimum,
-which is at least what was proved before. A theory `without` axioms is solved anew, as the claim does not hold.
+which is at least what was proved before. A theory for which prefixes are not exact (`theory/speedups.py`) is solved anew at each step.
 
 When time is short
 ------------------
 A map that predicts the step is minimal even if there is no time to look for others. Once there is none, the answer is feasible: the last
-bound, which holds for the longer trace by (1), and a map. That is a map of fewer steps that goes on like a sketch (`sketch.py`), and that the
-checker finds consistent; or a sketch of all steps. Where places have frames, a map that is contradicted is mended: what does not fit is
-something new. clingo is asked again when the trace is longer by RETRY and PAUSE; it goes on where it was stopped, and may prove a map minimal
-again.
+bound, which holds for the longer trace by (1), and a map. That is a map of fewer steps that goes on like a sketch (`guesses/tree.py`), and
+that the checker finds consistent; or a sketch of all steps. Where places have frames, a map that is
+contradicted is mended: what does not fit is something new. clingo is asked again when the trace is longer by RETRY and PAUSE; it goes on
+where it was stopped, and may prove a map minimal again.
 
-Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`guessing.py`), one after another, in a process
-of their own, and mended there where that takes longer than a step may.
+Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`online/background.py`), one after another,
+in a process of their own, and mended there where that takes longer than a step may.
 """
 
 from __future__ import annotations
@@ -45,12 +45,14 @@ from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.engines.base import AT_ONCE, Cost
 from ssh_abduction.errors import TraceError, brief
-from ssh_abduction.guesses.continuing import Sketch
-from ssh_abduction.judge.checker import check
+from ssh_abduction.guesses.tree import Sketch
+from ssh_abduction.judge.checker import check, unchecked
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.solver.search import ALL, Search, Seconds, Solution, Status
+from ssh_abduction.solver.result import Seconds, Solution, Status
+from ssh_abduction.solver.search import ALL, Search
 from ssh_abduction.steps.log import Outcome, observation
-from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.theory.evidence import Pairs, pairs_of
+from ssh_abduction.theory.speedups import Speedups, row
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Action, Step, Trace, View
 
@@ -91,12 +93,17 @@ class OnlineMapper:
         self.theory = theory.resolve(Trace((first,)))
         if theory.level == "causal":  # now rather than at the step that first needs it, as it takes its time
             importlib.import_module("ssh_abduction.engines.causal")
-        elif self.theory.has_frames:
+        elif row("visits").holds_for(self.theory):
             importlib.import_module("ssh_abduction.online.background")
         began = time.perf_counter()
         self.searches = 0  # how often clingo was asked
         self._without_stars = theory.star == "auto" and self.theory.star == "none"
         self._limit, self._most, self._speedups = limit, maps, speedups
+        self._pairs = pairs_of(Trace((first,)), self.theory)
+        self._replays = row("prefixes").holds_for(self.theory)
+        self._may_mend = row("visits").holds_for(self.theory)
+        self._may_sketch = self._replays and not unchecked(self.theory)
+        self._trusts_sketches = row("certain sketches").holds_for(self.theory)
         self._steps = [first]
         self._seen = [observation(first, self.theory)]
         self._actions: dict[str, Action] = {}
@@ -142,7 +149,7 @@ class OnlineMapper:
         self._actions[action.name] = action
         self._steps[-1:] = [last, step]
         self._seen.append(observation(step, self.theory))
-        if self._status is not Status.UNSATISFIABLE:
+        if self._status is not Status.UNSATISFIABLE or not self._replays:
             known = self.solution.maps[0] if self._maps or self._drafts else None
             self._replay(action, step)
             if not self._settled() and len(self._steps) >= self._next_search:
@@ -176,7 +183,7 @@ class OnlineMapper:
         self._drafts = [s for s in self._drafts if s.extend(action, step)]
         self._sketches = [s for s in self._sketches if s.extend(action, step)]
         self._complete = self._complete and Outcome.UNKNOWN not in outcomes
-        if self.theory.without:
+        if not self._replays:
             self._maps = []
         if not self._maps:
             if self._status is Status.OPTIMAL:
@@ -187,7 +194,7 @@ class OnlineMapper:
 
     def _draft(self, ssh_map: SSHMap, steps: int) -> None:
         """Let a map of so many steps go on like a sketch, unless it contradicts the steps since."""
-        if self.theory.without:
+        if not self._may_sketch:
             return
         sketch = Sketch.beyond(ssh_map, self.trace.prefix(steps), self.theory)
         since = zip(self._steps[steps - 1 :], self._steps[steps:], strict=False)
@@ -213,7 +220,7 @@ class OnlineMapper:
 
     def _may_guess(self) -> bool:
         """Whether a small map is wanted, and the steps are not too many to be compared in pairs."""
-        return self._status is Status.UNKNOWN and self._limit is not None and self.theory.has_frames and len(self._steps) <= AT_ONCE
+        return self._status is Status.UNKNOWN and self._limit is not None and self._may_mend and len(self._steps) <= AT_ONCE
 
     def _heed_guess(self) -> None:
         """Take the map that came of a guess."""
@@ -247,11 +254,11 @@ class OnlineMapper:
         steps = len(self._steps)
         self._next_search = max(steps + PAUSE, int(RETRY * steps)) if search.stopped in ("time limit", "interrupted") else 0
         self._asked = search.solution()
-        if search.status in (Status.OPTIMAL, Status.UNSATISFIABLE) or self.theory.without:
+        if search.status in (Status.OPTIMAL, Status.UNSATISFIABLE) or not self._replays:
             self._status, self._complete, self._cost = search.status, search.complete, self._asked.cost
             self._drafts = []
             if len(found) >= len(self._maps) or known is None:
-                self._maps = [_Replayed(m, self._seen) for m in found]
+                self._maps = [_Replayed(m, self._seen, self._pairs) for m in found]
         elif found:
             self._draft(found[0], steps)
 
@@ -282,19 +289,25 @@ class OnlineMapper:
         """The best draft that the checker finds consistent, or else a sketch of all steps, if there is one."""
         while self._drafts:
             draft = self._drafts[0]
-            if not draft.certain:
-                draft.certain = not check(self.trace, draft.map(), self.theory)
-            if draft.certain:
+            if self._is_consistent(draft):
                 return draft
             del self._drafts[0]
-        return self._sketches[0] if self._sketches else None
+        return next(filter(self._is_consistent, self._sketches), None) if self._may_sketch else None
+
+    def _is_consistent(self, sketch: Sketch) -> bool:
+        """Whether a sketch is consistent: as it is made so, or by the checker."""
+        if not sketch.certain or not self._trusts_sketches:
+            sketch.certain = not check(self.trace, sketch.map(), self.theory)
+        return sketch.certain
 
 
 class _Replayed:
     """A map, with the labels of the steps that it has predicted since."""
 
-    def __init__(self, ssh_map: SSHMap, seen: Sequence[object]) -> None:
+    def __init__(self, ssh_map: SSHMap, seen: Sequence[object], pairs: Pairs) -> None:
         self._map = ssh_map
+        self._pairs = pairs
+        self._place_of = [s.place for s in ssh_map.dstates]
         self._labels = list(ssh_map.labels)
         self._links = {(s, action): x for s, action, x in ssh_map.links}
         self._sights = dict(zip(self._labels, seen, strict=True))
@@ -307,6 +320,9 @@ class _Replayed:
         if self._sights[there] != seen:
             return Outcome.CONTRADICTED
         self._labels.append(there)
+        if not self._pairs.allow(len(self._labels) - 1, self._labels, self._place_of):
+            self._labels.pop()
+            return Outcome.CONTRADICTED
         return Outcome.PREDICTED
 
     def map(self) -> SSHMap:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +16,7 @@ from perception.recognition import LearningCurve
 from simulator.laser import BEARINGS
 from simulator.world import World
 from ssh_abduction.errors import SSHError
+from ssh_abduction.files import write_file
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.picture import COLOURS, SPACING, layout
 from ssh_abduction.reproduce.claims import Outcome
@@ -21,11 +24,20 @@ from ssh_abduction.reproduce.claims import Outcome
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"
 
 
-def _pyplot() -> Any:
+def require_matplotlib() -> None:
+    """Raises SSHError where nothing can be drawn: to be asked before hours of work, not after."""
     try:
-        import matplotlib
+        importlib.import_module("matplotlib")
     except ImportError:
-        raise SSHError("plot: expected matplotlib, got none; install ssh-abduction[plot]") from None
+        raise SSHError("plot: expected matplotlib to draw with, got none; pip install 'ssh-abduction[plot]'") from None
+    except Exception as error:  # of its settings, such as MPLBACKEND, which it reads when it is loaded
+        raise SSHError(f"plot: expected matplotlib to load, got {type(error).__name__}: {error}; mend its settings") from None
+
+
+def _pyplot() -> Any:
+    require_matplotlib()
+    import matplotlib
+
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
@@ -34,8 +46,10 @@ def _pyplot() -> Any:
 
 
 def _save(figure: Any, path: str | Path) -> None:
-    figure.savefig(path, bbox_inches="tight")
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format=Path(path).suffix[1:].lower(), bbox_inches="tight")
     _pyplot().close(figure)
+    write_file(path, drawn.getvalue())
 
 
 def draw_quality(path: str | Path, quality: Mapping[int, float], uncertainty: Mapping[int, float], chosen: int) -> None:

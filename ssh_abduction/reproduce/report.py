@@ -21,43 +21,69 @@ from simulator.robot import Body
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.errors import SSHError
+from ssh_abduction.files import write_file
 from ssh_abduction.learner import BootstrapLearner
 from ssh_abduction.picture import svg
 from ssh_abduction.reproduce import figures
-from ssh_abduction.reproduce.claims import EXPERIMENTS, VIEWS_ALONE, WITH_STARS, Run, measure, outcome, summary, to_dict, true_dstates
+from ssh_abduction.reproduce.claims import (
+    EXPERIMENTS,
+    VIEWS_ALONE,
+    WITH_STARS,
+    Outcome,
+    Run,
+    measure,
+    outcome,
+    summary,
+    to_dict,
+    true_dstates,
+)
 
 NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)  # metres
 SCALES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # times the spread that hill-climbing leaves
 
 
 def reproduce(
-    name: str, seeds: Sequence[int], folder: Path, jobs: int = 2, outcomes: bool = True, on_done: Callable[[str], None] = lambda _: None
+    name: str,
+    seeds: Sequence[int],
+    folder: Path,
+    jobs: int = 2,
+    outcomes: bool = True,
+    on_done: Callable[[str], None] = lambda _: None,
+    on_table: Callable[[list[dict[str, Any]]], None] = lambda _: None,
 ) -> list[dict[str, Any]]:
-    """Run an experiment for all seeds, and write everything into a folder. Returns the table of claims. Raises SSHError."""
+    """Run an experiment for all seeds, and write everything into a folder. Returns the table of claims. Raises SSHError.
+
+    on_done   is told what was done, `steps` times
+    on_table  is given the table once all data is written, before anything is drawn: a picture that fails loses nothing
+    """
     if name not in EXPERIMENTS:
         raise SSHError(f"experiment: expected one of {', '.join(EXPERIMENTS)}, got {name!r}")
     if not seeds:
         raise SSHError("seeds: expected at least one, got none; write 0-19")
+    figures.require_matplotlib()
     folder.mkdir(parents=True, exist_ok=True)
     runs: list[Run] = []
     for run in Parallel(n_jobs=jobs, return_as="generator")(delayed(measure)(name, seed) for seed in seeds):
         runs.append(run)
         on_done(f"seed {run.seed}")
     table = summary(name, runs)
-    _draw(name, runs[0], folder, on_done)
-    if outcomes and name == "notched-rectangle":
-        grid = [(notch, scale) for notch in NOTCHES for scale in SCALES]
-        found = []
-        for o in Parallel(n_jobs=jobs, return_as="generator")(delayed(outcome)(notch, scale) for notch, scale in grid):
-            found.append(o)
-            on_done(f"notch {100 * o.notch:g} cm, spread {1000 * o.spread:.1f} mm")
-        depth = -float(World.named(EXPERIMENTS[name].world).segments[:, 1::2].min())
-        figures.draw_outcomes(folder / "outcomes.png", found, (depth, 1.0))
-        _dump(folder / "outcomes.json", [asdict(o) for o in found])
     _dump(folder / "claims.json", table)
     _dump(folder / "runs.json", [to_dict(run) for run in runs])
     _dump(folder / "configuration.json", _configuration(name, seeds, outcomes))
-    (folder / "report.html").write_text(_page(name, runs, table, folder), encoding="utf-8")
+    found: list[Outcome] = []
+    if outcomes and name == "notched-rectangle":
+        grid = [(notch, scale) for notch in NOTCHES for scale in SCALES]
+        for o in Parallel(n_jobs=jobs, return_as="generator")(delayed(outcome)(notch, scale) for notch, scale in grid):
+            found.append(o)
+            on_done(f"notch {100 * o.notch:g} cm, spread {1000 * o.spread:.1f} mm")
+        _dump(folder / "outcomes.json", [asdict(o) for o in found])
+    write_file(folder / "report.html", _page(name, runs, table, folder).encode())
+    on_table(table)
+    _draw(name, runs[0], folder, on_done)
+    if found:
+        depth = -float(World.named(EXPERIMENTS[name].world).segments[:, 1::2].min())
+        figures.draw_outcomes(folder / "outcomes.png", found, (depth, 1.0))
+    write_file(folder / "report.html", _page(name, runs, table, folder).encode())
     return table
 
 
@@ -79,7 +105,7 @@ def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> 
     figures.draw_spread(folder / "spread.png", run.spread)
     starred = BootstrapLearner(WITH_STARS).fit(trace)
     for file, ssh_map in (("map", learner.map_), ("map-with-openings", starred.map_)):
-        (folder / f"{file}.svg").write_text(svg(ssh_map) + "\n", encoding="utf-8")
+        write_file(folder / f"{file}.svg", f"{svg(ssh_map)}\n".encode())
         figures.draw_map(folder / f"{file}.png", ssh_map)
     on_done("figures")
 
@@ -101,7 +127,7 @@ def _configuration(name: str, seeds: Sequence[int], outcomes: bool) -> dict[str,
 
 
 def _dump(path: Path, value: Any) -> None:
-    path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_file(path, f"{json.dumps(value, indent=1, ensure_ascii=False)}\n".encode())
 
 
 FIGURES = {

@@ -9,7 +9,7 @@
 Solving for a prefix, replaying to the end
 ------------------------------------------
 Grounding the axioms for a whole trace costs more than the square of its length, but once a map is closed the rest of the trace
-only re-traverses it. So `Search` solves for a prefix, replays the maps found over the whole trace (`replay.py`), and extends the
+only re-traverses it. So `Search` solves for a prefix, replays the maps found over the whole trace (`steps/log.py`), and extends the
 prefix, in the same clingo control, while a replay stops early. This is exact.
 
 *Claim.* Let every minimal map of a prefix, of cost c, replay to the end of the trace. Then the replayed maps are exactly the
@@ -36,7 +36,8 @@ alone). Else the control is made again with more names, at most one for each leg
 proved for a shorter one: that is quick where it exists, and then minimal without another proof.
 
 A map of the prefix that stops early is no answer; what its continuations are, the longer prefix says. The claim needs
-determinism, and that a dstate has one place, course and heading. A theory `without` axioms is therefore solved in one go.
+determinism, and that a dstate has one place, course and heading; and that axioms survive the cut. `theory/speedups.py` says for which theories
+that is known; any other is solved in one go.
 """
 
 from __future__ import annotations
@@ -44,19 +45,26 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from enum import Enum
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.asking import Grounding, Paused, Stop, Stopped, Watch
-from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Found, StepEngine
+from ssh_abduction.asp.control import Grounding
+from ssh_abduction.asp.limits import Paused, Stop, Stopped, Watch
+from ssh_abduction.asp.rules import check_rules
+from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Found
+from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.errors import SolverError, TheoryError, TraceError, brief
-from ssh_abduction.guesses.continuing import Sketch
-from ssh_abduction.judge.checker import check
+from ssh_abduction.guesses.tree import Sketch
+from ssh_abduction.judge.checker import check, unchecked
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.steps.certificate import RESTS_ON, Certificate, Evidence
-from ssh_abduction.steps.log import Log, Outcome
-from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.result import Bound, Progress, Seconds, Solution, Status
+from ssh_abduction.steps.certificate import Evidence
+from ssh_abduction.steps.log import Log, Outcome, Replay
+from ssh_abduction.theory.evidence import Equality, evidence_of
+from ssh_abduction.theory.speedups import Speedups, row
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
@@ -73,95 +81,6 @@ UNMAPPED = 2.0  # times as long that may take until there is any map
 ALL = Speedups()
 
 
-class Status(Enum):
-    """What is known about the trace."""
-
-    OPTIMAL = "optimal"  # minimal maps, proven
-    FEASIBLE = "feasible"  # a map of the whole trace and a bound, but no proof that it is minimal
-    UNSATISFIABLE = "unsatisfiable"  # no map satisfies the axioms, proven
-    UNKNOWN = "unknown"  # stopped before any map of the whole trace was found
-
-
-@dataclass(frozen=True, slots=True)
-class Bound:
-    """Lower bounds, proven, on the counts of every map of the trace; None where nothing is proven.
-
-    The order of preference proves a bound on the count that goes first; a search that was stopped also counts the steps that cannot be one
-    dstate (apart.py). The counts after the first are bounded only among the maps
-    that are minimal in what goes before: those bounds are in Solution.cost once the status is optimal.
-    """
-
-    dstates: int | None = None
-    places: int | None = None
-    paths: int | None = None
-    excuses: int | None = None
-
-    def to_dict(self) -> dict[str, int]:
-        counts = {"dstates": self.dstates, "places": self.places, "paths": self.paths, "excuses": self.excuses}
-        return {k: v for k, v in counts.items() if v is not None}
-
-
-@dataclass(frozen=True, slots=True)
-class Seconds:
-    """Wall-clock time: in all, for grounding, and for solving."""
-
-    total: float
-    ground: float
-    solve: float
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far a search is: the prefix it works on, the best cost and the bound so far, and the maps found."""
-
-    prefix: int
-    steps: int
-    cost: Cost | None
-    bound: Bound
-    maps: int
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True)
-class Solution:
-    """The answer for one trace.
-
-    maps       minimal maps (status optimal), or the best one found (feasible)
-    cost       the counts of the first of these maps; None where there is none. All share the counts that the theory prefers
-    bound      proven lower bounds on the counts of any map
-    complete   no further minimal map exists
-    theory     the theory, with star settled
-    steps      length of the trace
-    prefix     how many of its first steps had to be given to clingo
-    stopped    why the search ended before it was complete, else None
-    evidence   what the certificate is made from; None where the theory is without an axiom that this rests on
-    partial    where no map of the whole trace was found: the best map of its first steps
-    """
-
-    status: Status
-    maps: tuple[SSHMap, ...]
-    cost: Cost | None
-    bound: Bound
-    complete: bool
-    theory: Theory
-    steps: int
-    prefix: int
-    seconds: Seconds
-    evidence: Evidence | None = field(default=None, repr=False)
-    stopped: Stop | None = None
-    partial: SSHMap | None = None
-
-    @property
-    def certificate(self) -> Certificate | None:
-        """Why no map has fewer dstates. Worked out when it is first asked for; None where there is no evidence."""
-        return self.evidence.certificate if self.evidence else None
-
-    @property
-    def count(self) -> int:
-        """How many maps are listed."""
-        return len(self.maps)
-
-
 def solve(
     trace: Trace,
     theory: Theory | None = None,
@@ -171,6 +90,7 @@ def solve(
     memory: int | None = None,
     speedups: Speedups = ALL,
     on_progress: Callable[[Progress], None] | None = None,
+    **choices: Any,
 ) -> Solution:
     """Find the minimal maps of a trace.
 
@@ -181,12 +101,22 @@ def solve(
     memory       MiB of memory that the process may use at its peak before the search stops
     speedups     which speed-ups are on; none changes the answer
     on_progress  is told now and then how far the search is
+    choices      fields of Theory, laid over it: rules=["own.lp"], same=[(3, 12)], different=[(0, 4)], …
 
     Ctrl-C ends the search like a limit does. Raises TraceError or TheoryError where the trace lacks what the theory needs.
     Source: Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
+    if choices:
+        theory = _checked(theory).replace(**choices)
     search = Search(trace, theory, limit=limit, maps=maps, memory=memory, speedups=speedups, on_progress=on_progress)
     return search.solution(tuple(search))
+
+
+def _checked(theory: Theory | None) -> Theory:
+    """The theory that a caller gives, or the default. Raises TheoryError."""
+    if not isinstance(theory, Theory | None):
+        raise TheoryError(f"theory: expected a Theory, got {brief(theory)}; take Theory.topological(), Theory.causal() or Theory(…)")
+    return theory or Theory.topological()
 
 
 class Search:
@@ -213,8 +143,6 @@ class Search:
     ) -> None:
         if not isinstance(trace, Trace):
             raise TraceError(f"trace: expected a Trace, got {brief(trace)}; make one with Trace.load or Trace.from_steps")
-        if not isinstance(theory, Theory | None):
-            raise TheoryError(f"theory: expected a Theory, got {brief(theory)}; take Theory.topological(), Theory.causal() or Theory(…)")
         if isinstance(maps, bool) or not hasattr(maps, "__index__"):
             raise SolverError(f"maps (--maps): expected a whole number, 0 for all, got {brief(maps)}")
         for name, value in (("limit (--time-limit)", limit), ("memory (--memory-limit)", memory)):
@@ -226,7 +154,8 @@ class Search:
             raise SolverError(f"maps (--maps): expected 0 (all) or more, got {maps}")
         if memory is not None and memory <= 0:
             raise SolverError(f"memory (--memory-limit): expected a number of MiB above 0, got {brief(memory)}; leave it out for none")
-        self.theory = (theory or Theory.topological()).resolve(trace)
+        self.theory = _checked(theory).resolve(trace)
+        check_rules(self.theory)
         self.trace = trace
         self.status = Status.UNKNOWN
         self.bound = Bound()
@@ -241,8 +170,11 @@ class Search:
         self._most = maps
         self._goes_on = after is not None
         self._log = Log(trace, self.theory)
-        self._whole = not speedups.prefixes or bool(self.theory.without)
-        self._speedups = speedups
+        self._asked_speedups = speedups
+        self._speedups = speedups.that_hold_for(self.theory)
+        self._whole = not self._speedups.prefixes
+        self._refusing = evidence_of(self.theory)
+        self._judging = Judging(trace, self.theory)
         self._on_progress = on_progress
         self._watch = Watch(limit, memory, self._report)
         self._lower: tuple[int, ...] | None = None  # no map of the trace costs less
@@ -264,9 +196,7 @@ class Search:
 
     def _names_pay(self) -> bool:
         """Whether the theory lets dstates have names beforehand, and the trace is long enough for that to pay."""
-        theory = self.theory
-        causal = theory.level == "causal" and theory.prefer == ("dstates",) and not theory.without
-        return (causal or theory.has_frames) and self._speedups.names and len(self.trace) > FEW_STEPS
+        return self._speedups.names and len(self.trace) > FEW_STEPS
 
     def _new_engine(self) -> Engine:
         theory = self.theory
@@ -305,7 +235,9 @@ class Search:
                     if self._most and self.count == self._most:
                         self.stopped = "maps limit"
                         return
-                    self.count += 1
+                    self._judging.pass_map(ssh_map, self.prefix, self._watch.elapsed())
+                    # The first map is the best one: so the cost is its, also in the counts that the theory does not prefer.
+                    self.count, self.best = self.count + 1, self.best if self.count else ssh_map
                     self._report()
                     self._watch.stop()
                     yield ssh_map
@@ -329,6 +261,14 @@ class Search:
             self._watch.stop()
             self._engine.settle()
         self._raise_bound(self._engine.bound)
+        self._fall_back()
+        if self.status in (Status.FEASIBLE, Status.OPTIMAL) and not self.count and self.best is not None:
+            self._judging.pass_map(self.best, self.prefix, self._watch.elapsed())
+            self.count = 1
+            yield self.best
+
+    def _fall_back(self) -> None:
+        """Where the search was stopped: some map of the whole trace, if there was none, and a bound that takes no search."""
         if self.stopped and self.status is not Status.OPTIMAL:
             if self.best is None and self.stopped == "time limit" and self._watch.has_reserve:
                 self._salvage()
@@ -337,9 +277,6 @@ class Search:
             self._count_apart()
             if self.best is not None and self.status is Status.UNKNOWN:
                 self.status = Status.FEASIBLE
-        if self.status in (Status.FEASIBLE, Status.OPTIMAL) and not self.count and self.best is not None:
-            self.count = 1
-            yield self.best
 
     def interrupt(self) -> None:
         """End the search soon, with the best answer so far. For signal handlers and other threads."""
@@ -374,9 +311,25 @@ class Search:
             partial=None if self.best else self.partial,
         )
 
+    def snapshot(self, stopped: Stop) -> Solution:
+        """What is known while the search is still under way in another thread that cannot be stopped. The program ends then: it is of no use any more.
+
+        stopped  why it is to end
+        """
+        with suppress(Exception):  # what the other thread changes meanwhile: a bound is a bound, and a map a map, without that
+            if self.best is None and self.status in (Status.UNKNOWN, Status.FEASIBLE):
+                self._sketch()
+        self._raise_bound(self._engine.bound)
+        best = self.best
+        known = () if best is None else (best,)
+        if best is not None and self.status is Status.UNKNOWN:
+            self.status = Status.FEASIBLE
+        self.stopped = stopped
+        return replace(self.solution(known), complete=False)
+
     def _evidence(self, size: int) -> Evidence | None:
         """What shows that no map has fewer dstates: of the first `size` steps."""
-        if RESTS_ON & set(self.theory.without):
+        if not row("clique").holds_for(self.theory):
             return None
         number: dict[object, int] = {}
         views = tuple(number.setdefault(step.view, len(number)) for step in self.trace.steps[: max(size, 1)])
@@ -408,11 +361,11 @@ class Search:
 
     def _may_frame(self) -> bool:
         """Whether a map in which places have frames is worth seeking. While a robot drives there are sketches."""
-        return self._speedups.framing and self._may_take_all() and self.theory.with_frames() is not None
+        return self._speedups.framing and self._may_take_all()
 
     def _may_name(self) -> bool:
         """Whether dstates can be settled first, with names, though places have no frames."""
-        return self._speedups.ways and self._speedups.names and self._may_take_all() and self.theory.has_bare_places
+        return self._speedups.ways and self._asked_speedups.names and self._may_take_all()
 
     def _may_take_all(self) -> bool:
         """Whether something else than step by step is worth it, and the trace not too long for all of it at once."""
@@ -425,10 +378,10 @@ class Search:
         seconds = min(FRAMING, FRAMING_SHARE * self._watch.left())
         watch = self._watch.part(UNMAPPED * seconds)
         try:
-            for ssh_map in maps_with_frames(self.trace, self.theory, watch, self._speedups):
+            for ssh_map in maps_with_frames(self.trace, self.theory, watch, self._asked_speedups):
                 watch.shorten(seconds)
                 found = Found.of(ssh_map, self.theory)
-                if self.best is None or found.cost < self._cost:
+                if (self.best is None or found.cost < self._cost) and self._satisfies(ssh_map):
                     self._keep(found, ssh_map.labels)
                     self._report()
         except Stopped:
@@ -459,8 +412,8 @@ class Search:
             self._raise_bound(minimal.cost[0] if minimal.cost else None)
             if self._lower is None or minimal.cost > self._lower:
                 self._lower = minimal.cost
-            replayed = self._log.replay(minimal.map.labels)
-            if replayed.outcome is Outcome.PREDICTED:
+            replayed = self._replay(minimal.map)
+            if replayed.outcome is Outcome.PREDICTED and not self._refused(replace(minimal.map, labels=replayed.labels)):
                 self._keep(minimal, replayed.labels)
                 self.status = Status.OPTIMAL
                 return True
@@ -476,14 +429,14 @@ class Search:
 
     def _merge(self) -> None:
         """A causal map at once, that clingo has to better."""
-        theory = self.theory
-        if self._speedups.greedy and theory.level == "causal" and not theory.without:
+        if self._speedups.greedy and self.theory.level == "causal":
             found = facts.causal_map(self._log.merged(), self.trace)
-            self._keep(Found.of(found, theory), found.labels)
+            if self._satisfies(found):
+                self._keep(Found.of(found, self.theory), found.labels)
 
     def _sketch(self) -> None:
         """Where nothing was found in time: some map of the whole trace, made without a search; what goes on beyond that of a prefix, if it is better."""
-        if not self._speedups.greedy or self.theory.without:
+        if not self._speedups.greedy or unchecked(self.theory):
             return
         self._merge()
         if self.best is not None:
@@ -494,20 +447,45 @@ class Search:
             later = zip(trace.actions[len(sketch.labels) - 1 :], trace.steps[len(sketch.labels) :], strict=True)
             if all(sketch.extend(action, step) for action, step in later):
                 found = Found.of(sketch.map(), self.theory)
-                if (self.best is None or found.cost < self._cost) and (sketch.certain or not check(trace, found.map, self.theory)):
+                if (self.best is None or found.cost < self._cost) and self._satisfies(found.map):
                     self._keep(found, found.map.labels)
                 if sketch not in beyond:
                     return
 
+    def _satisfies(self, ssh_map: SSHMap) -> bool:
+        """Whether a map of the whole trace that nothing proves yet is known to satisfy all axioms."""
+        return not unchecked(self.theory) and not check(self.trace, ssh_map, self.theory) and not self._refused(ssh_map)
+
+    def _refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
+        """Equalities of a map that some evidence finds out cannot all hold; None where it refuses none."""
+        return next((found for evidence in self._refusing if (found := evidence.refuse(self.trace, ssh_map))), None)
+
+    def _replay(self, ssh_map: SSHMap, known: int | None = None) -> Replay:
+        """The trace replayed over a map of a prefix, of which so many steps make links."""
+        return self._log.replay(ssh_map.labels, known, [s.place for s in ssh_map.dstates] if self._log.pairs else None)
+
     def _minimise(self) -> Found | None:
-        """A minimal map of the prefix, or None where it has no map. Better maps of the whole trace are kept on the way."""
+        """A minimal map of the prefix that no evidence refuses, or None where it has no map.
+
+        What is refused of a map that clingo finds is forbidden, and clingo is asked again: the bounds of what it knew before still hold.
+        """
+        while True:
+            minimal = self._minimise_as_known()
+            refused = self._refused(minimal.map) if minimal else None
+            if not refused:
+                return minimal
+            self._engine.forbid(refused)
+
+    def _minimise_as_known(self) -> Found | None:
+        """A minimal map of the prefix by what clingo knows, or None. Better maps of the whole trace are kept on the way."""
         while True:
             minimal = None
             for found in self._candidates():
                 minimal = found
                 self.partial = found.map
-                replayed = self._log.replay(found.map.labels)
-                if replayed.outcome is Outcome.PREDICTED and (self.best is None or found.cost < self._cost):
+                replayed = self._replay(found.map)
+                better = self.best is None or found.cost < self._cost
+                if better and replayed.outcome is Outcome.PREDICTED and not self._refused(replace(found.map, labels=replayed.labels)):
                     self._keep(found, replayed.labels)
                 self._report()
                 if not self._whole and self._lower is not None and found.cost <= self._lower:
@@ -538,11 +516,11 @@ class Search:
         first = self.theory.priorities[0] if self.theory.priorities else None
         if self.theory.level == "causal":
             return 0
-        if cost is None or self.theory.without or first not in ("paths", "dstates"):
+        if cost is None or not self._speedups.path_names or first not in ("paths", "dstates"):
             return legs
         if first == "paths":
             return cost[0]
-        return min(legs, cost[0] // (1 if self.theory.all_on_paths else 2))
+        return min(legs, cost[0] // (1 if "course_needs_travel" in self.theory.given_up else 2))
 
     def _keep(self, found: Found, labels: tuple[int, ...]) -> None:
         self.best = replace(found.map, labels=labels)
@@ -559,15 +537,17 @@ class Search:
             streaming = self.prefix == len(self.trace)
             try:
                 for found in self._engine.maps_of_cost(self._cost, self._most and self._most + 1):
-                    replayed = self._log.replay(found.map.labels)
+                    replayed = self._replay(found.map)
                     if replayed.outcome is not Outcome.PREDICTED:
                         stuck = max(stuck, len(replayed.labels))
                         if streaming:
                             continue
                         break
-                    if any(self._log.replay(found.map.labels, size).outcome is Outcome.PREDICTED for size in streamed):
+                    if any(self._replay(found.map, size).outcome is Outcome.PREDICTED for size in streamed):
                         continue
                     whole = replace(found.map, labels=replayed.labels)
+                    if self._refused(whole):
+                        continue
                     if streaming:
                         yield whole
                         continue

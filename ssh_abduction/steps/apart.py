@@ -10,6 +10,9 @@ dstates as they are, in every theory that holds the axioms functional_view and d
 Where the steps of a group next differ in views, those of different subgroups are all apart: a largest clique is one of each subgroup,
 together. Where they differ in actions, none of them are: it is the largest of those of the subgroups. ∎
 
+Steps are sorted by how the trace goes on from them, as in a suffix array. The groups of the proof are then stretches of that order, so
+there is no matrix of all pairs: one row of it takes a pass over the sorted steps.
+
 >>> from ssh_abduction.steps.apart import Continuations
 >>> Continuations([0, 1, 0, 2, 0], [0, 0, 0, 0]).clique()
 [0, 1, 2, 3]
@@ -17,12 +20,13 @@ together. Where they differ in actions, none of them are: it is the largest of t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+COMPARED = 8000  # steps of a trace, at most, for which what evidence excludes is a matrix; it has the square of that many bytes
 SWAPS = 60  # attempts to better the clique of a view, at most; fewer where it has few steps
 
 Matrix = NDArray[np.bool_]
@@ -35,13 +39,20 @@ class Continuations:
     any two neighbours from the one to the other have.
     """
 
-    def __init__(self, seen: Sequence[int], actions: Sequence[int]) -> None:
+    def __init__(self, seen: Sequence[int], actions: Sequence[int], excluded: Collection[tuple[int, int]] = ()) -> None:
         """
-        seen     what was seen at each step
-        actions  what was done after each step but the last, numbered from 0
+        seen      what was seen at each step
+        actions   what was done after each step but the last, numbered from 0
+        excluded  pairs of steps that are not one dstate, as evidence says; so are the steps from which the same actions lead to such a pair
         """
         shown, done = np.asarray(seen), np.append(np.asarray(actions, dtype=int), -1) + 1
         steps = len(shown)
+        self._seen = seen
+        self._excluded = _spread(excluded, done) if excluded and steps <= COMPARED else None
+        self._partners: dict[int, list[int]] = {}  # of a trace that is too long for that, as they are given
+        for i, j in excluded if self._excluded is None else ():
+            self._partners.setdefault(i, []).append(j)
+            self._partners.setdefault(j, []).append(i)
         ranks = [_ranked(shown * (done.max() + 1) + done)]  # by the first 1, 2, 4, … views and actions
         while ranks[-1].max() < steps - 1:
             then = np.zeros(steps, dtype=int)
@@ -64,7 +75,16 @@ class Continuations:
         shared[place + 1 :] = np.minimum.accumulate(self._shared[place:])
         differ = (shared % 2 == 0) & (shared >= 2 * actions)  # views are the first to differ
         differ[place] = False
-        row: Matrix = differ[self._place]
+        row: Matrix = differ[self._place] | self.excluded_from(step)
+        return row
+
+    def excluded_from(self, step: int) -> Matrix:
+        """Which steps are apart from this one because evidence says so."""
+        if self._excluded is not None:
+            row: Matrix = self._excluded[step]
+            return row
+        row = np.zeros(len(self._place), dtype=bool)
+        row[self._partners.get(step, [])] = True
         return row
 
     def apart(self) -> Matrix:
@@ -76,16 +96,32 @@ class Continuations:
         return apart
 
     def clique(self) -> list[int]:
-        """A largest clique of steps, in order; among the largest, one whose steps are apart from most."""
+        """A largest clique of steps, in order; among the largest, one whose steps are apart from most.
+
+        Evidence leaves no tree of groups: with it, the clique is the larger one of that and of one that is found greedily.
+        """
         # Of groups that go on, each within the one before, what its steps have in common, and its clique so far:
         begun: list[tuple[int, _Clique]] = []
         for step, shared in zip(self._sorted.tolist(), [*self._shared.tolist(), -1], strict=True):
-            clique = _Clique((step,), 0, 1)
+            so_far = _Clique((step,), 0, 1)
             while begun and begun[-1][0] >= shared:
                 common, before = begun.pop()
-                clique = before.joined(clique, apart=common % 2 == 0)
-            begun.append((shared, clique))
-        return sorted(begun[0][1].steps)
+                so_far = before.joined(so_far, apart=common % 2 == 0)
+            begun.append((shared, so_far))
+        largest = sorted(begun[0][1].steps)
+        if self._excluded is not None:
+            return max(largest, clique(self.apart(), self._seen), key=len)
+        return largest
+
+
+def _spread(excluded: Collection[tuple[int, int]], done: NDArray[np.int_]) -> Matrix:
+    """Pairs of steps that are not one dstate, and those from which the same actions lead to such a pair: steps x steps."""
+    found = np.zeros((len(done), len(done)), dtype=bool)
+    first, second = np.array(list(excluded)).T
+    found[first, second] = found[second, first] = True
+    for step in range(len(done) - 2, -1, -1):
+        found[step, :-1] |= (done[:-1] == done[step]) & found[step + 1, 1:]
+    return found
 
 
 @dataclass(frozen=True, slots=True)

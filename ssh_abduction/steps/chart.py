@@ -2,7 +2,7 @@
 
 To the causal theory each step is a node, and each action a link to the next. In a theory where places have frames (star=frame), a turn
 rotates by known quarters: so the steps between two travels, a *visit*, are at one place, and those of a visit that face the same way are
-one node, linked by rotations both ways. Nodes are apart if that follows from what was seen and done, as in `apart.py`.
+one node, linked by rotations both ways. Nodes are apart if that follows from what was seen and done, as in `steps/apart.py`.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.steps.chart import Chart
@@ -17,12 +17,13 @@ one node, linked by rotations both ways. Nodes are apart if that follows from wh
 from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
 from ssh_abduction.steps.log import Log
+from ssh_abduction.theory.pairs import Earlier
 from ssh_abduction.trace import Trace, TurnDirection
 
 if TYPE_CHECKING:
@@ -43,19 +44,22 @@ class NoFrame(Exception):  # noqa: N818 - not an error
 class Chart:
     """Nodes, numbered by the first step at them, and links.
 
-    seen     the observation at each node
-    links    node, action, node. A rotation by J quarters is the action -J
-    node_of  the node of each step
+    seen      the observation at each node
+    links     node, action, node. A rotation by J quarters is the action -J
+    node_of   the node of each step
+    excluded  pairs of nodes that are not one dstate, as evidence says
     """
 
     seen: tuple[int, ...]
     links: tuple[Link, ...]
     node_of: Sequence[int]
+    excluded: Collection[tuple[int, int]] = field(default=(), kw_only=True)
 
     @staticmethod
     def of_steps(log: Log, size: int) -> Chart:
         """The chart of the first steps, each a node."""
-        return Chart(tuple(log.seen[:size]), tuple((t, log.actions[t], t + 1) for t in range(size - 1)), range(size))
+        links = tuple((t, log.actions[t], t + 1) for t in range(size - 1))
+        return Chart(tuple(log.seen[:size]), links, range(size), excluded=_among(log.pairs.apart, size))
 
     def apart(self) -> NDArray[np.bool_]:
         """Which pairs of nodes are apart: nodes x nodes."""
@@ -66,16 +70,20 @@ class Chart:
         """How the trace goes on from each node."""
         from ssh_abduction.steps.apart import Continuations  # loads numpy
 
-        return Continuations(self.seen, [action for _, action, _ in self.links])
+        return Continuations(self.seen, [action for _, action, _ in self.links], self.excluded)
 
     def is_map(self, labels: Sequence[int]) -> bool:
-        """Whether the labels of all nodes are those of a map: each dstate shows one view, and each action leads to one dstate."""
+        """Whether the labels of all nodes are those of a map: each dstate shows one view, and each action leads to one dstate.
+
+        Nor is any pair of nodes one dstate that evidence excludes.
+        """
         view: dict[int, int] = {}
         leads: dict[tuple[int, int], int] = {}
         return (
             min(labels) >= 0
             and all(view.setdefault(label, seen) == seen for label, seen in zip(labels, self.seen, strict=True))
             and all(leads.setdefault((labels[t], action), labels[u]) == labels[u] for t, action, u in self.links)
+            and all(labels[i] != labels[j] for i, j in self.excluded)
         )
 
     @staticmethod
@@ -133,7 +141,22 @@ class Chart:
             (s, -((k - j) % 4), x) for (v, j), s in node.items() for k in range(4) if k != j and (x := node.get((v, k))) is not None
         ]
         links = sorted([*travels, *rotations], key=lambda link: max(link[0], link[2]))
-        return FramedChart(tuple(seen), tuple(links), tuple(node_of), tuple(node), tuple(stars), tuple(travels))
+        facing = tuple(node)
+        away = {(node_of[i], node_of[j]) for i, j in _among(log.pairs.elsewhere, size)}
+        excluded = {(node_of[i], node_of[j]) for i, j in _among(log.pairs.apart, size)} - away
+        if any(i == j for i, j in excluded) or any(facing[i][0] == facing[j][0] for i, j in away):
+            raise NoFrame
+        return FramedChart(
+            tuple(seen),
+            tuple(links),
+            tuple(node_of),
+            facing,
+            tuple(stars),
+            tuple(travels),
+            frozenset(away),
+            frozenset(away),
+            excluded=frozenset(excluded),
+        )
 
 
 @dataclass(frozen=True)
@@ -144,12 +167,18 @@ class FramedChart(Chart):
     stars    what is open on each visit, by slot; or what is seen there
     travels  the links that are travels, in order: the visit's number is that of the travel after it
     elsewhere  pairs of nodes known to be at different places
+    away     those of them that evidence says
     """
 
     facing: tuple[tuple[int, int], ...]
     stars: tuple[tuple[int, ...], ...]
     travels: tuple[Link, ...]
-    elsewhere: Collection[tuple[int, int]] = ()
+    elsewhere: frozenset[tuple[int, int]] = frozenset()
+    away: frozenset[tuple[int, int]] = frozenset()
+
+    def with_elsewhere(self, more: Iterable[tuple[int, int]]) -> FramedChart:
+        """The same chart, where these nodes, too, are known to be at different places."""
+        return replace(self, elsewhere=self.elsewhere | frozenset(more))
 
     def __getstate__(self) -> dict[str, object]:
         """To another process goes what is given, and not the large arrays that were made of it."""
@@ -235,6 +264,10 @@ class FramedChart(Chart):
         misfits = np.zeros((4, visits, visits), dtype=bool)
         for s, x in self.elsewhere:
             misfits[:, self.facing[s][0], self.facing[x][0]] = misfits[:, self.facing[x][0], self.facing[s][0]] = True
+        for s, x in self.excluded:
+            (i, faced), (j, other) = self.facing[s], self.facing[x]
+            if i != j:
+                misfits[(other - faced) % 4, i, j] = misfits[(faced - other) % 4, j, i] = True
         for i in range(visits - 1, -1, -1):
             for r in range(4):
                 row = misfits[r, i]
@@ -246,6 +279,11 @@ class FramedChart(Chart):
                     alike = ((leaves[i] + r) % 4 == leaves) & (action == action[i])
                     row[:-1] |= alike[:-1] & misfits[0, i + 1, 1:]
         return misfits
+
+
+def _among(earlier: Earlier, size: int) -> list[tuple[int, int]]:
+    """The pairs of the first steps, the earlier step first."""
+    return [(i, t) for t, others in earlier.items() if t < size for i in others]
 
 
 def numbered(labels: Iterable[Hashable]) -> list[int]:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Step, Trace
 
@@ -23,7 +24,7 @@ class Outcome(Enum):
     """How a replay ended."""
 
     PREDICTED = "predicted"  # every step of the trace is explained
-    CONTRADICTED = "contradicted"  # the dstate reached shows something else
+    CONTRADICTED = "contradicted"  # the dstate reached shows something else, or evidence says that the step is not there
     UNKNOWN = "unknown"  # the action was never tried in the dstate
 
 
@@ -51,16 +52,21 @@ class Log:
 
     actions   which action was done at each step
     seen      which observation was made
+    pairs     what evidence says of pairs of steps
     """
 
     def __init__(self, trace: Trace, theory: Theory) -> None:
+        self.pairs = pairs_of(trace, theory)
         actions: dict[str, int] = {}
         seen: dict[object, int] = {}
         self.actions = [actions.setdefault(a.name, len(actions)) for a in trace.actions]
         self.seen = [seen.setdefault(observation(step, theory), len(seen)) for step in trace.steps]
 
-    def replay(self, labels: Sequence[int], known: int | None = None) -> Replay:
-        """Replay the trace over the map that `labels` make of its first steps; `known` of them make links (default all)."""
+    def replay(self, labels: Sequence[int], known: int | None = None, place_of: Sequence[int | None] | None = None) -> Replay:
+        """Replay the trace over the map that `labels` make of its first steps; `known` of them make links (default all).
+
+        place_of  the place of each dstate of the map, if it has any: what evidence says of pairs of steps may be about these
+        """
         actions, seen = self.actions, self.seen
         known = len(labels) if known is None else known
         if known == len(seen):
@@ -80,6 +86,10 @@ class Log:
                 break
             label = following
             found.append(label)
+            if t in self.pairs.asked_for and not self.pairs.allow(t, found, place_of):
+                found.pop()
+                outcome = Outcome.CONTRADICTED
+                break
         return Replay(tuple(found), outcome)
 
     def merged(self) -> tuple[int, ...]:

@@ -9,34 +9,44 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
-LEVELS = ("causal", "topological", "boundary", "star")
-_AXIOM = re.compile(r"^% @axiom\((?P<name>\w+)\) (?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if (?P<when>.+))?$")
+FIRST = ("causal", "topological", "boundary", "star")  # each needs those before it; files that are added come after them, by name
+_AXIOM = re.compile(r"^% @axiom\((?P<name>\w+)\) (?:(?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if (?P<when>.+))?|(?P<alone>.+))$")
 _WHEN = re.compile(r"^% @when (?P<when>.+)$")
+_KEEPS = re.compile(r"^% @keeps (?P<names>.+)$")
 
 
 @dataclass(frozen=True)
 class Axiom:
-    """One axiom: its name, what it says, where it is from, its encoding's level, and the choices of a theory that switch it on."""
+    """One axiom: its name, what it says, where it is from, its encoding's level, and the choices of a theory that switch it on.
+
+    subject     the choices without which there is nothing that the axiom speaks of
+    conditions  those, and the ones that choose the axiom itself
+    """
 
     name: str
     sentence: str
     source: str
     level: str
+    subject: tuple[str, ...]
     conditions: tuple[str, ...]
 
     def holds_in(self, choices: Mapping[str, object]) -> bool:
         """Whether a theory with these fields has the axiom."""
         return all(_holds(condition, choices) for condition in self.conditions)
 
+    def has_subject_in(self, choices: Mapping[str, object]) -> bool:
+        """Whether a theory with these fields speaks of what the axiom is about."""
+        return all(_holds(condition, choices) for condition in self.subject)
+
 
 def _holds(condition: str, choices: Mapping[str, object]) -> bool:
-    """`field=value|value`, `field`, or `not field`."""
+    """`field=value|value`, `field`, `field|field` where any of these will do, or `not field`."""
     if "=" in condition:
         field, values = condition.split("=")
         return choices[field] in values.split("|")
     if condition.startswith("not "):
         return not choices[condition.removeprefix("not ")]
-    return bool(choices[condition])
+    return any(choices[field] for field in condition.split("|"))
 
 
 @cache
@@ -47,21 +57,44 @@ def folder() -> Path:
 
 
 def path(name: str) -> str:
-    """The path of the encoding `name`, for clingo to load."""
-    at = folder() / f"{name}.lp"
-    return str(at if at.is_file() else folder() / "fast" / f"{name}.lp")
+    """The path of the encoding `name`, for clingo to load: one of the readable ones, or of the fast ones."""
+    readable = folder() / f"{name}.lp"
+    return str(readable if readable.exists() else folder() / "fast" / f"{name}.lp")
+
+
+@cache
+def levels() -> tuple[str, ...]:
+    """The encodings that hold axioms, in the order to load them: a file that is put into the folder is one of them."""
+    found = [file.stem for file in folder().glob("*.lp") if "\n% @axiom(" in file.read_text(encoding="utf-8")]
+    return tuple(sorted(found, key=lambda name: (FIRST.index(name) if name in FIRST else len(FIRST), name)))
 
 
 @cache
 def axioms() -> tuple[Axiom, ...]:
     """Every axiom of every level, in the order of the files."""
-    found = []
-    for level in LEVELS:
-        conditions: tuple[str, ...] = ()
-        for line in (folder() / f"{level}.lp").read_text(encoding="utf-8").splitlines():
-            if match := _WHEN.match(line):
-                conditions += tuple(match["when"].split(" and "))
-            elif match := _AXIOM.match(line):
-                own = tuple(match["when"].split(" and ")) if match["when"] else ()
-                found.append(Axiom(match["name"], match["sentence"], match["source"], level, conditions + own))
-    return tuple(found)
+    return tuple(axiom for level in levels() for axiom in axioms_in((folder() / f"{level}.lp").read_text(encoding="utf-8"), level))
+
+
+def axioms_in(text: str, level: str) -> list[Axiom]:
+    """The axioms that the comments of an encoding name."""
+    found: list[Axiom] = []
+    subject: tuple[str, ...] = ()
+    for line in text.splitlines():
+        if match := _WHEN.match(line):
+            subject += tuple(match["when"].split(" and "))
+        elif match := _AXIOM.match(line):
+            own = tuple(match["when"].split(" and ")) if match["when"] else ()
+            found.append(Axiom(match["name"], match["sentence"] or match["alone"], match["source"] or "", level, subject, subject + own))
+    return found
+
+
+def needed_by(choices: Mapping[str, object]) -> tuple[str, ...]:
+    """The encodings that a theory with these fields needs, in the order to load them: those of its axioms, also of axioms that it leaves out."""
+    return tuple(level for level in levels() if any(axiom.holds_in(choices) for axiom in axioms() if axiom.level == level))
+
+
+@cache
+def keeps(*names: str) -> frozenset[str]:
+    """The axioms that these fast encodings say at their heads that they keep, together."""
+    lines = [line for name in names for line in Path(path(name)).read_text(encoding="utf-8").splitlines()]
+    return frozenset(axiom for line in lines if (match := _KEEPS.match(line)) for axiom in match["names"].split())

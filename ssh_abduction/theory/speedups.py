@@ -1,37 +1,31 @@
-"""What makes solving fast, each to be switched off alone: for tests, and to see what it gains (docs/performance.md)."""
+"""What makes solving fast, and for which theories: the one table that decides.
+
+Users add axioms and evidence, and speed-ups rest on the axioms that they were made for. So a speed-up names the axioms that it rests on, which no
+one may have given up, and the axioms that it keeps: it is on for a theory only if it keeps all that the theory demands. What it does not know switches
+it off, so that an axiom that is added is obeyed everywhere.
+
+>>> from ssh_abduction import Theory
+>>> from ssh_abduction.theory.speedups import Speedups
+>>> Speedups().that_hold_for(Theory(different=[(0, 2)])).prefixes
+True
+>>> Speedups().that_hold_for(Theory(without=["one_place"])).prefixes
+False
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields, replace
+from typing import Final
 
 from ssh_abduction.errors import SolverError, brief
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.theory import Theory
 
 
 @dataclass(frozen=True, slots=True)
 class Speedups:
-    """Which speed-ups are on. None changes the answer.
-
-    prefixes     solve for a prefix, replay its maps, and extend it where they fail
-    path_names   begin with few names for paths
-    from_below   ask a longer prefix first for a map that costs what was proved for a shorter one
-    names        causal theory: give the dstates names beforehand; full theory where places have frames: settle them before places and paths
-    clique       with names: pin steps that are pairwise apart; with frames: let such nodes be the first at their dstates, and pin
-                 stretches no two of which can be one path
-    apart        with names: say which steps are apart, where more than one action shows it
-    lazy         with names: give clingo only the links that replaying contradicts; with frames: of a long trace only the visits without which others are lost
-    core_guided  with names or frames: raise the bound from below, rather than better the map
-    small_cores  with frames: make cores smaller, as long as that is cheap
-    sides        with frames: say what order and sides forbid while dstates are sought, street by street
-    annealed     with names or frames: where clingo takes its time, a map near a guess, so that a small one is known
-    framing      full theory where places need have no frames: where clingo takes its time, seek a map in which they have, so that a small one is known
-    ways         full theory without stars: where clingo takes its time, settle dstates before places and paths, with names
-    watched      with names or frames: make constraints of three literals longer, so that clasp watches two of them rather than all three
-    one_by_one   with names: where that stalls, ask for numbers of dstates one by one
-    threads      with names or frames: two threads, where a trace is hard and there are two processors
-    processes    with frames: a guess is made in a process of its own, where there are two processors
-    greedy       some map without a search, for a time limit that leaves no other; in the causal theory a small one where clingo takes its time
-    """
+    """Which speed-ups are on. None changes the answer; `TABLE` says what each is, and for which theories it is left on."""
 
     prefixes: bool = True
     path_names: bool = True
@@ -52,6 +46,11 @@ class Speedups:
     processes: bool = True
     greedy: bool = True
 
+    def __post_init__(self) -> None:
+        for name in SPEEDUPS:
+            if not isinstance(getattr(self, name), bool):
+                raise SolverError(f"speedups: {name}: expected true or false, got {brief(getattr(self, name))}")
+
     @classmethod
     def without(cls, names: str | Iterable[str]) -> Speedups:
         """All but these. Raises SolverError."""
@@ -61,5 +60,220 @@ class Speedups:
                 raise SolverError(f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(name)}")
         return cls(**dict.fromkeys(off, False))
 
+    def that_hold_for(self, theory: Theory) -> Speedups:
+        """Those of these that the table leaves on for a theory whose star is settled."""
+        valid = {speedup.switch for speedup in TABLE if speedup.holds_for(theory)}
+        return replace(self, **{name: False for name in SPEEDUPS if name not in valid})
+
 
 SPEEDUPS = tuple(f.name for f in fields(Speedups))
+
+
+@dataclass(frozen=True)
+class Speedup:
+    """One row of the table.
+
+    name      what it is called; rows that one switch turns on or off differ in this
+    switch    the field of `Speedups`
+    sentence  what it does
+    suits     the theories that it is made for
+    rests_on  axioms that it needs, as far as there is something that they speak of: none of them may be left out or be excused
+    keeps     axioms whose maps it does not lose or add to; EVERY where whatever is added only takes maps away, or is asked of each map
+    """
+
+    name: str
+    switch: str
+    sentence: str
+    suits: Callable[[Theory], bool]
+    rests_on: frozenset[str]
+    keeps: Callable[[], frozenset[str]] | None
+
+    def holds_for(self, theory: Theory) -> bool:
+        """Whether it changes no answer of a theory whose star is settled."""
+        return self.suits(theory) and not self.rests_on & theory.given_up and (self.keeps is EVERY or theory.demands <= self.keeps())
+
+
+EVERY: Final = None
+
+
+def _any_theory(theory: Theory) -> bool:
+    return True
+
+
+def _keeps_headings(theory: Theory) -> bool:
+    """Whether a dstate has one heading, if it has any."""
+    return theory.star != "frame" or "one_heading" in theory.hard
+
+
+def _is_causal(theory: Theory) -> bool:
+    return theory.level == "causal" and theory.prefer == ("dstates",)
+
+
+def _has_paths(theory: Theory) -> bool:
+    return theory.level == "topological"
+
+
+def _has_frames(theory: Theory) -> bool:
+    return theory.star == "frame" and theory.priorities[:1] == ("dstates",) and theory.path_order == "total"
+
+
+def _has_bare_places(theory: Theory) -> bool:
+    return theory.level == "topological" and theory.star == "none" and theory.priorities[:1] == ("dstates",)
+
+
+def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozenset[str]]:
+    """What the heads of fast encodings say, read when it is first asked for; and what Python adds to these."""
+    return lambda: encodings.keeps(*names) | frozenset(and_also)
+
+
+CAUSAL = frozenset({"functional_view", "deterministic"})
+ONE_OF_EACH = CAUSAL | {"one_place", "one_course"}  # a dstate has one observation, one place, and one course
+TRAVELS_AND_TURNS = CAUSAL | {
+    "one_place",
+    "turn_stays",
+    "travel_leaves",
+    "travel_follows_path",
+    "one_course",
+    "turn_around_reverses",
+    "turn_changes_path",
+}
+PLACES = TRAVELS_AND_TURNS | {
+    "course_needs_travel",
+    "one_dstate_per_course",
+    "on_path",
+    "travel_orders",
+    "order_asymmetric",
+    "order_transitive",
+}
+FRAMES = PLACES | {
+    "path_order_total",
+    "star_pattern",
+    "star_frame",
+    "one_heading",
+    "turn_rotates",
+    "one_dstate_per_heading",
+    "path_goes_straight",
+}
+NOTHING: frozenset[str] = frozenset()
+# The axioms that a map of a trace, cut down to some first steps, still satisfies, and that speak of links, observations and pairs of steps alone.
+SURVIVE_A_CUT = FRAMES | {
+    "next_place",
+    "all_on_paths",
+    "branch_side",
+    "symmetric_sides",
+    "side_of_branch",
+    "side_of_branch, excusable",
+    "sides_disjoint",
+    "path_between_sides",
+    "asserted",
+    "asserted same",
+}
+
+TABLE = (
+    Speedup(
+        "prefixes",
+        "prefixes",
+        "Solve for a prefix, replay its maps, and extend it where they fail.",
+        _keeps_headings,
+        ONE_OF_EACH,
+        lambda: SURVIVE_A_CUT,
+    ),
+    Speedup(
+        "from_below",
+        "from_below",
+        "Ask a longer prefix first for a map that costs what was proved for a shorter one.",
+        _keeps_headings,
+        ONE_OF_EACH,
+        lambda: SURVIVE_A_CUT,
+    ),
+    Speedup("path_names", "path_names", "Begin with few names for paths.", _has_paths, TRAVELS_AND_TURNS, EVERY),
+    Speedup(
+        "named dstates",
+        "names",
+        "Causal theory: give the dstates names before clingo is asked.",
+        _is_causal,
+        CAUSAL,
+        _kept_by("names", and_also=["asserted"]),
+    ),
+    Speedup(
+        "visits",
+        "names",
+        "Places with frames: settle dstates, as visits that are one, before places and paths.",
+        _has_frames,
+        FRAMES,
+        _kept_by("same", "sides", "streets", and_also=["asserted"]),
+    ),
+    Speedup(
+        "ways",
+        "ways",
+        "Places without stars: where clingo takes its time, settle dstates before places and paths, with names.",
+        _has_bare_places,
+        PLACES,
+        _kept_by("names", "ways", "courses", and_also=["asserted"]),
+    ),
+    Speedup(
+        "clique",
+        "clique",
+        "Steps, or stretches of paths, no two of which can be one, are given names of their own.",
+        _any_theory,
+        CAUSAL,
+        EVERY,
+    ),
+    Speedup("apart", "apart", "With names: say which steps are apart, where more than one action shows it.", _any_theory, CAUSAL, EVERY),
+    Speedup(
+        "sides", "sides", "With frames: say what order and sides forbid while dstates are sought, path by path.", _has_frames, FRAMES, EVERY
+    ),
+    Speedup("lazy", "lazy", "Give clingo only the links, or the visits, without which others go wrong.", _any_theory, NOTHING, EVERY),
+    Speedup("core_guided", "core_guided", "Raise the bound from below, rather than better the map.", _any_theory, NOTHING, EVERY),
+    Speedup("small_cores", "small_cores", "With frames: make cores smaller, as long as that is cheap.", _any_theory, NOTHING, EVERY),
+    Speedup(
+        "one_by_one",
+        "one_by_one",
+        "With names: where raising the bound stalls, ask for numbers of dstates one by one.",
+        _any_theory,
+        NOTHING,
+        EVERY,
+    ),
+    Speedup(
+        "watched", "watched", "Make constraints of three literals longer, so that clasp watches two of them.", _any_theory, NOTHING, EVERY
+    ),
+    Speedup("threads", "threads", "Two threads, where a trace is hard and there are two processors.", _any_theory, NOTHING, EVERY),
+    Speedup(
+        "processes",
+        "processes",
+        "With frames: make a guess in a process of its own, where there are two processors.",
+        _any_theory,
+        NOTHING,
+        EVERY,
+    ),
+    Speedup("annealed", "annealed", "Where clingo takes its time, a map near a guess; it passes the checker.", _any_theory, NOTHING, EVERY),
+    Speedup(
+        "greedy",
+        "greedy",
+        "Some map without a search, for a limit that leaves no other; it passes the checker.",
+        _any_theory,
+        NOTHING,
+        EVERY,
+    ),
+    Speedup(
+        "certain sketches",
+        "greedy",
+        "While a robot drives: a map made without a search is consistent as it is made, and is not checked.",
+        _keeps_headings,
+        PLACES - {"course_needs_travel"},
+        lambda: SURVIVE_A_CUT - {"asserted", "asserted same"},
+    ),
+    Speedup(
+        "framing",
+        "framing",
+        "Places that need no frames: where clingo takes its time, a map in which they have some; it passes the checker.",
+        lambda theory: (framed := theory.with_frames()) is not None and row("visits").holds_for(framed),
+        NOTHING,
+        EVERY,
+    ),
+)
+
+
+def row(name: str) -> Speedup:
+    """A row of the table, by its name."""
+    return next(speedup for speedup in TABLE if speedup.name == name)

@@ -16,9 +16,12 @@ from typing import Any, Literal, TypeAlias
 
 from ssh_abduction.errors import TheoryError, TraceError, brief
 from ssh_abduction.theory import encodings
+from ssh_abduction.theory.pairs import Pairs
+from ssh_abduction.theory.rules import Rules
 from ssh_abduction.trace import Step, Trace
 
 Count: TypeAlias = Literal["dstates", "paths", "places", "excuses"]
+Pair: TypeAlias = tuple[int, int]  # of steps
 
 CHOICES: dict[str, tuple[str, ...]] = {
     "level": ("causal", "topological"),
@@ -27,6 +30,19 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "star": ("auto", "none", "pattern", "frame"),
 }
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
+MOST_STEPS = 2**31  # a trace has fewer, and clingo counts no further
+ASSERTIONS = ("same", "different", "elsewhere")
+SPOKEN_FOR = {
+    "level",
+    *CHOICES,
+    "symmetric_sides",
+    "next_place",
+    "all_on_paths",
+    "prefer",
+    "without",
+    "rules",
+    *ASSERTIONS,
+}  # by axioms, or by `prefer`
 CAUSAL = "Theory.causal() (--theory causal)"  # in error messages
 
 
@@ -45,6 +61,8 @@ class Theory:
     prefer           what is minimised, first to last, of dstates, paths, places, and, with boundary=defeasible, excuses, which go
                      first unless named; what is not named is not minimised
     without          names of axioms left out, to see what they do
+    rules            a user's own rules: paths of files over the predicates of the encodings, or Rules
+    same, different, elsewhere  pairs of steps that are one dstate; that are not; and that are not even at one place: what a person knows
 
     The axioms and their sources are in docs/theory.md; `ssh-abduction theory` prints them.
     """
@@ -58,16 +76,24 @@ class Theory:
     star: Literal["auto", "none", "pattern", "frame"] = "auto"
     prefer: tuple[Count, ...] = ("dstates", "paths", "places")
     without: tuple[str, ...] = ()
+    rules: tuple[Rules, ...] = ()
+    same: tuple[Pair, ...] = ()
+    different: tuple[Pair, ...] = ()
+    elsewhere: tuple[Pair, ...] = ()
 
     def __post_init__(self) -> None:
         for name, values in CHOICES.items():
             if getattr(self, name) not in values:
                 raise TheoryError(f"{name}: expected one of {', '.join(values)}, got {brief(getattr(self, name))}")
-        for name in ("symmetric_sides", "next_place", "all_on_paths"):
-            if not isinstance(getattr(self, name), bool):
-                raise TheoryError(f"{name}: expected true or false, got {brief(getattr(self, name))}")
+        for field in fields(self):
+            if isinstance(field.default, bool) and not isinstance(getattr(self, field.name), bool):
+                raise TheoryError(f"{field.name}: expected true or false, got {brief(getattr(self, field.name))}")
         self._set_names("prefer", COUNTS)
         self._set_names("without", [a.name for a in encodings.axioms()])
+        object.__setattr__(self, "rules", Rules.all_of(self.rules))
+        for name in ASSERTIONS:
+            object.__setattr__(self, name, _pairs(name, getattr(self, name)))
+        self._check_rules()
         if self.level == "causal":
             for name, value in (("boundary", "none"), ("star", "none")):
                 if getattr(self, name) != value:
@@ -76,6 +102,16 @@ class Theory:
                 raise TheoryError(f"prefer: expected dstates with level=causal, got {', '.join(self.prefer)}; take {CAUSAL}")
         if "excuses" in self.prefer and self.boundary != "defeasible":
             raise TheoryError(f"prefer: expected no excuses with boundary={self.boundary}; take {_choice('boundary', 'defeasible')}")
+
+    def _check_rules(self) -> None:
+        taken = {axiom.name for axiom in encodings.axioms()}
+        for rules in self.rules:
+            for axiom in rules.axioms:
+                if axiom.name in taken:
+                    raise TheoryError(
+                        f"{rules.name}: @axiom({axiom.name}): expected a name that no other axiom has; give it one of its own"
+                    )
+                taken.add(axiom.name)
 
     def _set_names(self, field: str, allowed: Iterable[str]) -> None:
         value = getattr(self, field)
@@ -121,43 +157,45 @@ class Theory:
 
     @cached_property
     def axioms(self) -> tuple[str, ...]:
-        """The names of the axioms that hold. With star=auto, those of a trace without stars."""
-        return tuple(a.name for a in encodings.axioms() if a.name not in self.without and a.holds_in(vars(self)))
+        """The names of the axioms that hold, those of the user's own rules last. With star=auto, those of a trace without stars."""
+        own = [axiom.name for rules in self.rules for axiom in rules.axioms]
+        return (*(a.name for a in encodings.axioms() if a.name not in self.without and a.holds_in(vars(self))), *own)
 
-    @property
-    def has_frames(self) -> bool:
-        """Whether places have frames, and framed.py knows the axioms and the preference."""
-        return (
-            self.star == "frame"
-            and self.priorities[:1] == ("dstates",)
-            and self.boundary in ("none", "strict")
-            and self.path_order == "total"
-            and not (self.next_place or self.all_on_paths or self.without)
-        )
+    @cached_property
+    def hard(self) -> frozenset[str]:
+        """The axioms that nothing may break: all but the one that boundary=defeasible lets pairs of paths be excused from."""
+        return frozenset(self.axioms) - ({"side_of_branch"} if self.boundary == "defeasible" else set())
 
-    @property
-    def has_bare_places(self) -> bool:
-        """Whether places have no frames, no stars either, and ways.py knows the axioms and the preference."""
-        return (
-            self.level == "topological"
-            and self.star == "none"
-            and self.priorities[:1] == ("dstates",)
-            and self.boundary in ("none", "strict")
-            and not (self.next_place or self.all_on_paths or self.without)
-        )
+    @cached_property
+    def given_up(self) -> frozenset[str]:
+        """The axioms that do not hold of something that the theory speaks of: they are not chosen, left out, or may be broken."""
+        return frozenset(a.name for a in encodings.axioms() if a.has_subject_in(vars(self))) - self.hard
+
+    @cached_property
+    def demands(self) -> frozenset[str]:
+        """All that a speed-up has to keep: the axioms, with what may be excused by a name of its own; and what no axiom speaks for."""
+        excusable = {f"{name}, excusable" for name in set(self.axioms) - self.hard}
+        asserted = {"asserted same"} if self.same else set()
+        rules = {f"the rules of {rules.name}" for rules in self.rules}
+        others = {f"the field {f.name}" for f in fields(self) if f.name not in SPOKEN_FOR and getattr(self, f.name) != f.default}
+        return self.hard | excusable | asserted | rules | others
+
+    @cached_property
+    def asserted(self) -> Pairs:
+        """What somebody says of pairs of steps, once for each theory, as there may be many."""
+        return Pairs.of(self.different, self.elsewhere, self.same)
 
     def with_frames(self) -> Theory | None:
         """A theory in which places have frames and fewest dstates come first, and whose maps, but for their headings, are maps of this one.
 
-        None where there is no such theory, or framed.py does not know it (`has_frames`). The trace need have no stars. Its maps have all axioms of this theory: their paths are totally
+        None for the causal level. The trace need have no stars. Its maps have all axioms of this theory: their paths are totally
         ordered, their boundaries, if there are any, strict, so that no pair of paths is excused, and stars that agree in a frame are one pattern.
         """
         if self.level == "causal":
             return None
         boundary = "none" if self.boundary == "none" else "strict"
         rest = [count for count in self.prefer if count in ("paths", "places")]
-        framed = self.replace(star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest))
-        return framed if framed.has_frames else None
+        return self.replace(star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest))
 
     def resolve(self, trace: Trace) -> Theory:
         """This theory with `star` settled for a trace, after checking that the trace has what the axioms need.
@@ -194,9 +232,24 @@ class Theory:
         except TraceError as error:
             raise TraceError(f"{where}: {error}, or take {_choice('star', 'none')}") from None
 
+    def check_steps(self, trace: Trace) -> None:
+        """Raises TheoryError where a pair names a step that the trace does not have."""
+        for name in ASSERTIONS:
+            for pair in getattr(self, name):
+                if max(pair) >= len(trace):
+                    raise TheoryError(f"{name} (--{name}): expected steps from 0 to {len(trace) - 1}, got {pair[0]},{pair[1]}")
+
+    def of_steps(self, first: int, length: int) -> Theory:
+        """The theory of so many steps from the first one on, numbered from 0: pairs with other steps are dropped."""
+        kept = {
+            name: tuple((i - first, j - first) for i, j in getattr(self, name) if first <= min(i, j) and max(i, j) < first + length)
+            for name in ASSERTIONS
+        }
+        return replace(self, **kept)  # type: ignore[arg-type]
+
     def to_dict(self) -> dict[str, Any]:
         """The theory as plain data."""
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+        return {k: [list(e) if isinstance(e, tuple) else e for e in v] if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Theory:
@@ -205,6 +258,34 @@ class Theory:
             raise TheoryError(f"theory: expected an object, got {brief(data)}")
         preset = cls.causal() if data.get("level") == "causal" else cls()
         return preset.replace(**{str(k): tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+
+
+class _Checked(tuple[Pair, ...]):
+    """Pairs that were checked before: there may be many, and a theory is often made of another one."""
+
+
+def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
+    """Pairs of steps, each in order, once: from pairs, or from text such as 3,12. Raises TheoryError."""
+    if isinstance(value, _Checked):
+        return value
+    mend = f"write {field}=[(3, 12)] (--{field} 3,12)"
+    if isinstance(value, str):
+        value = [value]
+    if not isinstance(value, Iterable) or isinstance(value, Mapping | bytes):
+        raise TheoryError(f"{field}: expected pairs of steps, got {brief(value)}; {mend}")
+    found: dict[Pair, None] = {}
+    for given in value:
+        pair = given.split(",") if isinstance(given, str) else given
+        try:
+            steps = [int(step) if isinstance(step, str) else step.__index__() for step in pair]
+        except (AttributeError, TypeError, ValueError):
+            steps = []
+        if len(steps) != 2 or min(steps) < 0 or max(steps) >= MOST_STEPS or any(isinstance(step, bool) for step in pair):
+            raise TheoryError(f"{field}: expected pairs of steps, counted from 0, got {brief(given)}; {mend}")
+        if steps[0] == steps[1]:
+            raise TheoryError(f"{field}: expected two steps, got {steps[0]} twice; {mend}")
+        found[min(steps), max(steps)] = None
+    return _Checked(found)
 
 
 def _choice(name: str, value: str) -> str:

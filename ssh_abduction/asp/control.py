@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 import atexit
-import math
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Any, TypeVar
 
 import clingo
 
 from ssh_abduction.asp import facts
+from ssh_abduction.asp.limits import POLL, Stopped, Watch, peak_memory
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import Speedups
 
-RESERVE = 0.2  # share of the time limit kept for finding any map of the whole trace
-POLL = 0.05  # seconds between looks at the clock and for Ctrl-C
-TICK = 0.5  # seconds between reports of progress while clingo is busy
+PREPARING = (
+    0.6,
+    1.0,
+)  # of the time and of the memory that grounding took, clasp takes about so much before it begins to solve, and can be stopped
 
+_ONE = clingo.Number(1)
 _grounding = threading.Lock()
 _under_way: set[clingo.SolveHandle] = set()  # searches of clingo's, each in a thread
-
-Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,121 +34,6 @@ class Grounding:
 
     rules: int
     atoms: int
-
-
-class Stopped(Exception):  # noqa: N818 - not an error
-    def __init__(self, reason: Stop) -> None:
-        self.reason = reason
-
-
-class Paused(Exception):  # noqa: N818 - not an error
-    """Something else is to be done first."""
-
-
-class Watch:
-    """The limits of a search: `check` raises when one is over. Time that the caller of a stream takes does not count.
-
-    limit    seconds, or None
-    memory   MiB that the process may use, or None
-    on_tick  called now and then
-    beside  the watch of the search that this one is beside: that one ends it, and what cannot be interrupted is not begun where too little time is left
-    """
-
-    def __init__(
-        self,
-        limit: float | None = None,
-        memory: float | None = None,
-        on_tick: Callable[[], None] = lambda: None,
-        *,
-        beside: Watch | None = None,
-    ) -> None:
-        self._beside = beside
-        self._on_tick = on_tick
-        self._next_tick = TICK
-        self._limit = limit
-        self._allowed = None if limit is None else limit * (1 - RESERVE)
-        self._memory = memory
-        self._started: float | None = None
-        self._spent = 0.0
-        self._pause_at = math.inf
-        self.interrupted = False
-
-    def start(self) -> None:
-        self._started = time.perf_counter()
-
-    @property
-    def has_reserve(self) -> bool:
-        return self._allowed != self._limit
-
-    @property
-    def running(self) -> bool:
-        return self._started is not None
-
-    def use_reserve(self) -> None:
-        """From now on the whole time limit may be used."""
-        self._allowed = self._limit
-
-    def stop(self) -> None:
-        self._spent, self._started = self.elapsed(), None
-
-    def part(self, seconds: float) -> Watch:
-        """A watch, started, for so many seconds of this one's time, which is looked at now and then."""
-        part = Watch(seconds, self._memory, self.check)
-        part.use_reserve()
-        part.start()
-        return part
-
-    def shorten(self, seconds: float) -> None:
-        """From now on the time limit is this, if that is less."""
-        self._limit = self._allowed = seconds if self._limit is None else min(seconds, self._limit)
-
-    def pause_after(self, seconds: float) -> None:
-        """Let `check` raise Paused, once, when so much time was spent."""
-        self._pause_at = seconds
-
-    def elapsed(self) -> float:
-        return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
-
-    def check(self, ahead: float = 0.0) -> None:
-        """Raise if a limit is over, or would be after so many seconds of what cannot be interrupted."""
-        if self.interrupted:
-            raise Stopped("interrupted")
-        if self.elapsed() > self._next_tick:
-            self._next_tick = self.elapsed() + TICK
-            self._on_tick()
-        if not self.allows(ahead):
-            raise Stopped("time limit")
-        if self._memory is not None and peak_memory() > self._memory:
-            raise Stopped("memory limit")
-        if self.elapsed() > self._pause_at:
-            self._pause_at = math.inf
-            raise Paused
-
-    def allows(self, seconds: float) -> bool:
-        """Whether there is time for so many seconds of what cannot be interrupted."""
-        if self._allowed is not None and self.elapsed() + seconds > self._allowed:
-            return False
-        return not seconds or self._beside is None or self._beside.left() >= seconds
-
-    def memory_left(self) -> float | None:
-        """MiB until the memory limit, of which other processes may use as much."""
-        if self._memory is None:
-            return self._beside.memory_left() if self._beside else None
-        return self._memory - peak_memory()
-
-    def left(self) -> float:
-        """Seconds until the time limit."""
-        return math.inf if self._limit is None else self._limit - self.elapsed()
-
-
-def peak_memory() -> float:
-    """The most memory this process has used, in MiB. On Linux getrusage begins with what the process that began this one used."""
-    with suppress(OSError, StopIteration), open("/proc/self/status", "rb") as status:
-        return next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:")) / 2**10
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 
 
 @atexit.register
@@ -181,10 +65,20 @@ Made = TypeVar("Made")
 
 
 class Control(clingo.Control):
-    """A control without warnings. One at a time reads and grounds: side by side, threads wait for each other at each symbol, which takes three times as long."""
+    """A control without warnings. One at a time reads and grounds: side by side, threads wait for each other at each symbol, which takes three times as long.
 
-    def __init__(self, options: Sequence[str] = ()) -> None:
+    check    called now and then while clingo grounds, where an encoding has `@go_on`; what it raises ends that, and the control is of no use then
+    preparing  how much of the time and of the memory that grounding took clasp takes before it begins to solve, about
+    seconds  that clingo grounded since it last began to solve, and by how many MiB the process has grown meanwhile
+    """
+
+    def __init__(
+        self, options: Sequence[str] = (), check: Callable[[], None] = lambda: None, preparing: tuple[float, float] = PREPARING
+    ) -> None:
         super().__init__(["--warn=none", *options])
+        self.preparing = preparing
+        self.seconds = self.mebibytes = 0.0
+        self._check = check
 
     def load(self, path: str) -> None:
         with _grounding:
@@ -195,8 +89,40 @@ class Control(clingo.Control):
             super().add(*program)
 
     def ground(self, parts: Sequence[tuple[str, Sequence[clingo.Symbol]]] = (("base", ()),), context: Any = None) -> None:
-        with _grounding:
-            super().ground(parts, context)
+        asked = _Asked(self._check)
+        while not _grounding.acquire(timeout=POLL):
+            self._check()
+        began, before = time.perf_counter(), peak_memory()
+        try:
+            super().ground(parts, context or asked)
+        except BaseException:
+            if asked.raised is not None:  # clingo raises another one of this type, made from this one
+                raise asked.raised from None
+            raise
+        finally:
+            _grounding.release()
+            self.seconds += time.perf_counter() - began
+            self.mebibytes += peak_memory() - before
+
+
+class _Asked:
+    """What clingo asks while it grounds: whether to go on."""
+
+    def __init__(self, check: Callable[[], None]) -> None:
+        self.raised: BaseException | None = None
+        self._check = check
+        self._next = time.perf_counter() + POLL
+
+    def go_on(self, *_: clingo.Symbol) -> clingo.Symbol:
+        """1, unless `check` raises. That is called seldom, as clingo may ask this millions of times."""
+        try:
+            if time.perf_counter() > self._next:
+                self._check()
+                self._next = time.perf_counter() + POLL
+        except BaseException as error:
+            self.raised = error
+            raise
+        return _ONE
 
 
 class Asker:
@@ -289,6 +215,9 @@ class Asker:
         configuration: Any = control.configuration.solve
         configuration.opt_mode, configuration.models, configuration.project = mode, models, project
         configuration.solve_limit = f"{conflicts},-1"
+        if isinstance(control, Control):
+            self._watch.check(control.preparing[0] * control.seconds, control.preparing[1] * control.mebibytes)
+            control.seconds = control.mebibytes = 0.0
         began = time.perf_counter()
         with ExitStack() as stack:
             with _held_back_interrupts():

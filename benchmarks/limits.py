@@ -1,0 +1,192 @@
+"""Do limits hold? Traces with flaws, in which most places look new, under limits of time and memory: the worst overshoot of either.
+
+    python benchmarks/limits.py --cases 40 --seed 0 [--python]
+
+Promised: time within 1.2 times the limit and 1 s, start-up included, and memory within 1.2 times the limit and 200 MiB, and valid JSON on the output.
+Every case is a process of its own: the command line, which has a guard that ends it in time whatever clingo is at; or, with --python, `solve` of the
+Python interface, which has none. The same seed gives the same cases; the time that they take depends on what else the machine does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from instances import maze, moore, rectangle
+
+from ssh_abduction import Trace
+
+TIME, MEMORY = (1.2, 1.0), (1.2, 200.0)  # times the limit, and seconds or MiB beyond that, that are promised
+PYTHON = """
+import json, sys
+from ssh_abduction import Trace, solve
+from ssh_abduction.theory.theory import PRESETS
+path, theory, limit, memory = sys.argv[1:]
+solution = solve(Trace.load(path), PRESETS[theory](), limit=float(limit), memory=int(memory) or None)
+print(json.dumps({"status": solution.status.value}))
+sys.exit({"optimal": 0, "feasible": 10, "unsatisfiable": 20, "unknown": 30}[solution.status.value])
+"""
+GIVEN_UP = 30.0  # seconds beyond what is promised after which a process is killed
+CODES = {"optimal": 0, "feasible": 10, "unsatisfiable": 20, "unknown": 30}
+
+
+def aces(circuits: int, seed: int) -> Trace:
+    """A drive like that of the ACES building: corridors, of which most look new, and a few circuits of them."""
+    chance = random.Random(seed)
+    corridor = [f"v{chance.randrange(12)}" for _ in range(23)]
+    done = [chance.choice(["travel", "travel", "right", "around"]) for _ in corridor]
+    return Trace.from_steps(corridor * circuits + corridor[:1], done * circuits)
+
+
+FAMILIES: dict[str, tuple[str, Callable[[int, int], Trace]]] = {
+    "rectangle": ("topological", lambda steps, _: rectangle(max(steps // 8, 3)).trace),
+    "rectangle, causal": ("causal", lambda steps, _: rectangle(max(steps // 8, 3)).trace),
+    "like ACES": ("topological", lambda steps, seed: aces(max(steps // 23, 1), seed)),
+    "maze": ("topological", lambda steps, seed: maze(6, 6, steps=steps, seed=seed).trace),
+    "maze with stars": ("topological", lambda steps, seed: maze(6, 6, steps=steps, seed=seed, stars=True).trace),
+    "random machine, causal": ("causal", lambda steps, seed: moore(60, 4, steps=steps, seed=seed).trace),
+}
+
+
+def flawed(trace: Trace, flaws: int, chance: random.Random) -> Trace:
+    """A trace with so many flaws: a view of another step, a step left out or doubled, an action that another one is taken for."""
+    steps = list(trace.steps)
+    for _ in range(flaws):
+        t = chance.randrange(1, len(steps) - 1)
+        flaw = chance.choice(["view", "dropped", "doubled", "action", "last view"])
+        if flaw in ("view", "last view"):
+            t = len(steps) - 1 if flaw == "last view" else t
+            other = chance.choice([step for step in steps if step.view != steps[t].view])
+            steps[t] = replace(steps[t], view=other.view, star=other.star)
+        elif flaw == "action":
+            steps[t] = replace(steps[t], action=chance.choice([step.action for step in steps if step.action]))
+        elif flaw == "dropped":
+            del steps[t]
+        else:
+            steps.insert(t, steps[t])
+    return Trace(tuple(steps), name=trace.name)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A trace, and the limits under which it is solved: seconds, and MiB or none."""
+
+    family: str
+    trace: Trace
+    seconds: float
+    mebibytes: int | None
+
+    def command(self, path: Path, *, python: bool) -> list[str]:
+        """What is run."""
+        if python:
+            return [sys.executable, "-c", PYTHON, str(path), FAMILIES[self.family][0], str(self.seconds), str(self.mebibytes or 0)]
+        limits = [f"--time-limit={self.seconds}", *([f"--memory-limit={self.mebibytes}"] if self.mebibytes else [])]
+        return [sys.executable, "-m", "ssh_abduction", "solve", str(path), "--json", f"--theory={FAMILIES[self.family][0]}", *limits]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a case.
+
+    seconds    from the start of the process to its end, and
+    mebibytes  at its peak, each as a share of what is promised
+    status     that was printed, or what was wrong with that
+    """
+
+    case: Case
+    seconds: float
+    mebibytes: float
+    status: str
+
+
+def cases(count: int, seed: int, longest: int = 2000, seconds: Sequence[float] = (0.5, 1, 2, 5, 10)) -> Iterator[Case]:
+    """So many cases, the families by turns."""
+    chance = random.Random(seed)
+    families = list(FAMILIES)
+    for number in range(count):
+        family = families[number % len(families)]
+        steps = round(20 * (longest / 20) ** chance.random())
+        trace = flawed(FAMILIES[family][1](steps, chance.randrange(1000)), chance.choice([0, 1, 1, 1, 3]), chance)
+        yield Case(family, trace, chance.choice(seconds), chance.choice([None, None, 300, 600, 1500]))
+
+
+def outcome(case: Case, folder: Path, *, python: bool = False) -> Outcome:
+    """Solve a case in a process of its own."""
+    path, output = folder / "trace.jsonl", folder / "solution.json"
+    case.trace.save(path)
+    command = case.command(path, python=python)
+    promised = TIME[0] * case.seconds + TIME[1]
+    began = time.monotonic()
+    with output.open("wb") as written, subprocess.Popen(command, stdout=written, stderr=subprocess.PIPE) as process:
+        used = None
+        while used is None:
+            number, status, usage = os.wait4(process.pid, os.WNOHANG)
+            if number:
+                used = usage
+            else:
+                time.sleep(0.01)
+                if time.monotonic() - began > promised + GIVEN_UP:
+                    process.kill()
+        taken = time.monotonic() - began
+        process.returncode = os.waitstatus_to_exitcode(status)
+    most = MEMORY[0] * case.mebibytes + MEMORY[1] if case.mebibytes else float("inf")
+    return Outcome(case, taken / promised, used.ru_maxrss / 2**10 / most, _status(output, process.returncode))
+
+
+def _status(output: Path, code: int) -> str:
+    try:
+        printed = json.loads(output.read_text())
+    except ValueError:
+        return f"no JSON, exit code {code}"
+    status = str(printed["status"])
+    return status if CODES[status] == code else f"{status}, exit code {code}"
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """Markdown: a row for each family."""
+    rows = [
+        "| traces | cases | optimal | feasible | unknown | other | time, worst share of what is promised | memory, the same |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for family in FAMILIES:
+        of_family = [found for found in outcomes if found.case.family == family]
+        if not of_family:
+            continue
+        counts = [sum(found.status == status for found in of_family) for status in ("optimal", "feasible", "unknown")]
+        worst = max(found.seconds for found in of_family), max(found.mebibytes for found in of_family)
+        cells = [family, len(of_family), *counts, len(of_family) - sum(counts), *(f"{share:.0%}" for share in worst)]
+        rows.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--longest", type=int, default=2000, help="steps of the longest traces")
+    parser.add_argument("--python", action="store_true", help="by the Python interface rather than the command line")
+    options = parser.parse_args()
+    outcomes = []
+    with tempfile.TemporaryDirectory() as folder:
+        for case in cases(options.cases, options.seed, options.longest):
+            found = outcome(case, Path(folder), python=options.python)
+            outcomes.append(found)
+            limits = f"{case.seconds} s, {case.mebibytes or 'any'} MiB"
+            told = f"{case.family}, {len(case.trace)} steps, {limits}: {found.status}, {found.seconds:.0%} of the time, {found.mebibytes:.0%} of the memory"
+            print(told, file=sys.stderr, flush=True)
+            if max(found.seconds, found.mebibytes) > 1:
+                case.trace.save(Path(tempfile.gettempdir()) / f"over-{options.seed}-{len(outcomes)}.jsonl")
+    print(table(outcomes))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""What the shell is told of a search: its JSON, its exit code, and why there is no map."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from ssh_abduction.asp.control import Grounding
+from ssh_abduction.explain import Explanation, Interrupted, explain
+from ssh_abduction.files import json_line
+from ssh_abduction.solver import Search, Solution, Status
+
+_heard: list[int] = []  # signals that asked for an end
+EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}
+
+
+def exit_code(solution: Solution) -> int:
+    """What the shell is told of a solution."""
+    return interrupted_code() if solution.stopped == "interrupted" else EXIT_CODES[solution.status]
+
+
+def interrupted_code() -> int:
+    """What the shell is told where somebody ended the search: 130 after Ctrl-C, 143 after SIGTERM."""
+    return 128 + (_heard[-1] if _heard else signal.SIGINT)
+
+
+def explained(search: Search) -> Explanation | None:
+    """Why there is no map, if that is so and there is time to find out."""
+    if search.status is not Status.UNSATISFIABLE:
+        return None
+    try:
+        return explain(search.trace, search.theory, search.over)
+    except Interrupted:
+        return None
+
+
+def opening(search: Search) -> dict[str, Any]:
+    """What the JSON of a solution says before its maps."""
+    return {"theory": search.theory.to_dict(), "steps": len(search.trace)}
+
+
+def ending(search: Search, solution: Solution, explanation: Explanation | None, maps: int, grounding: Grounding) -> dict[str, Any]:
+    """What the JSON of a solution says after its maps, of which there were so many."""
+    end: dict[str, Any] = {
+        "status": solution.status.value,
+        "complete": solution.complete,
+        "count": maps,
+        "cost": solution.cost.to_dict() if solution.cost else None,
+        "bound": solution.bound.to_dict(),
+        "prefix": solution.prefix,
+        "grounding": asdict(grounding),
+        "seconds": {k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")},
+    }
+    if solution.certificate:
+        end["certificate"] = solution.certificate.to_dict(search.trace)
+    if solution.stopped:
+        end["stopped"] = solution.stopped
+    if solution.partial:
+        end["partial"] = solution.partial.to_dict()
+    if found := warnings_of(search, solution):
+        end["warnings"] = found
+    if explanation:
+        end["explanation"] = explanation.to_dict()
+    return end
+
+
+def warnings_of(search: Search, solution: Solution) -> list[str]:
+    """What makes the trace suspicious, a sentence each."""
+    return [solution.noise.sentence(search.trace)] if solution.noise else []
+
+
+def warn(warnings: Sequence[str]) -> None:
+    """Say so on stderr."""
+    for warning in warnings:
+        print(f"ssh-abduction: warning: {warning}", file=sys.stderr)
+
+
+def dump(value: dict[str, Any]) -> str:
+    """JSON on one line."""
+    return json_line(value)
+
+
+@contextlib.contextmanager
+def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
+    """Ctrl-C and SIGTERM do this, rather than stop the program wherever it is: what was found is still printed. None: nothing, nor in processes that begin."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may handle signals
+        return
+
+    def hear(number: int, _: object) -> None:
+        _heard.append(number)
+        if action:
+            action()
+
+    before = {number: signal.signal(number, hear if action else signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

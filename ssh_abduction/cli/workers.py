@@ -1,0 +1,220 @@
+"""Processes that do one piece of work after another, each begun anew rather than forked: a process that is forked while a thread grounds may wait for ever.
+
+They end when the process that began them does, however that ends: their input ends then. One that is killed loses the piece it was at, and no other.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from typing import Any, BinaryIO, NamedTuple
+
+STARTING = 10.0  # seconds that a process may take to begin, at most, on a machine that has much else to do
+POLL = 0.05  # seconds between looks at whether all is to stop
+
+_BEGIN = b"\0ssh-abduction answers\n"  # what is printed before, as Python begins, is no answer
+_SERVE = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from ssh_abduction.cli.workers import serve; serve()"
+
+
+class Lost(NamedTuple):
+    """A piece of work without an answer: its process was killed, or did not answer in time."""
+
+    number: int
+    late: bool
+
+
+class Worker:
+    """A process that does one piece of work at a time, until `end`.
+
+    deadline  when the piece under way is to be answered, at the latest; then the process is killed
+    """
+
+    def __init__(self) -> None:
+        self.deadline: float | None = None
+        self._late = False
+        command = [sys.executable, "-c", _SERVE]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        self._send(sys.path)
+        self._begun = False
+
+    def end(self) -> None:
+        """Kill the process, and close what leads to it."""
+        self.kill()
+        self._process.wait()
+        for end in (self._process.stdin, self._process.stdout):
+            with suppress(OSError):  # what was not read by then
+                assert end
+                end.close()
+
+    @property
+    def is_alive(self) -> bool:
+        return self._process.poll() is None
+
+    def done(self, number: int, work: Callable[..., Any], arguments: tuple[object, ...]) -> Any:
+        """What `work` makes of these arguments and, as the last one, whether that is given up; Lost if the process ends before. All of it is picklable."""
+        self._send((work, arguments))
+        output = self._process.stdout
+        assert output
+        try:
+            while not self._begun:
+                line = output.readline()
+                self._begun = line.endswith(_BEGIN)
+                if not line:
+                    return self._lost(number)
+            return pickle.load(output)
+        except (EOFError, pickle.UnpicklingError):
+            return self._lost(number)
+        finally:
+            self.deadline = None
+
+    def _lost(self, number: int) -> Lost:
+        self._process.kill()
+        self._process.wait()
+        return Lost(number, self._late)
+
+    def give_up(self) -> None:
+        """Let the work under way end soon, and none begin."""
+        self._send(None)
+
+    def end_if_late(self) -> None:
+        """Kill the process if its answer is overdue."""
+        if self.deadline is not None and time.monotonic() > self.deadline:
+            self._late = True
+            self.kill()
+
+    def kill(self) -> None:
+        self._process.kill()
+
+    def _send(self, message: object) -> None:
+        assert self._process.stdin
+        with suppress(OSError, ValueError):  # it has ended
+            pickle.dump(message, self._process.stdin)
+            self._process.stdin.flush()
+
+
+def answers(
+    work: Callable[..., Any],
+    tasks: Sequence[tuple[Any, ...]],
+    processes: int,
+    stopped: Callable[[], bool],
+    seconds: float | None,
+    patience: float,
+) -> Iterator[Any]:
+    """What `work` makes of each task, whose first argument is its number, in so many processes, as it is ready; Lost where there is no answer.
+
+    stopped   whether all is to end: no task begins any more, those under way are given up
+    seconds   that a task may take, until its process is killed; None where there is no such limit
+    patience  seconds that a task may take once it is given up
+    """
+    waiting = queue.SimpleQueue[tuple[Any, ...]]()
+    for task in tasks:
+        waiting.put(task)
+    ready = queue.SimpleQueue[Any]()  # answers, and a None for each thread that ends
+    workers: list[Worker | None] = [None] * processes
+
+    def run(place: int) -> None:
+        try:
+            while not stopped():
+                task = waiting.get_nowait()
+                worker = workers[place]
+                begins = worker is None or not worker.is_alive
+                if worker is not None and begins:
+                    worker.end()
+                if worker is None or begins:
+                    worker = workers[place] = Worker()
+                if seconds is not None:
+                    worker.deadline = time.monotonic() + seconds + (STARTING if begins else 0.0)
+                ready.put(worker.done(task[0], work, task))
+        except queue.Empty:
+            pass
+        except BaseException as error:
+            ready.put(error)
+        finally:
+            ready.put(None)
+
+    threads = [threading.Thread(target=run, args=(place,), daemon=True) for place in range(processes)]
+    for thread in threads:
+        thread.start()
+    running, told = processes, set[Worker]()
+    try:
+        while running:
+            for worker in filter(None, workers):
+                worker.end_if_late()
+            for worker in {*filter(None, workers)} - told if stopped() else ():
+                told.add(worker)
+                worker.give_up()
+                worker.deadline = time.monotonic() + patience
+            with suppress(queue.Empty):
+                answer = ready.get(timeout=POLL)
+                if answer is None:
+                    running -= 1
+                elif isinstance(answer, BaseException):
+                    raise answer
+                else:
+                    yield answer
+    finally:
+        for worker in filter(None, workers):
+            worker.end()
+
+
+class _Work:
+    """The pieces of work that come in, in a process that does them."""
+
+    def __init__(self) -> None:
+        self._given_up = False
+        self._waiting = queue.SimpleQueue[tuple[Callable[..., Any], tuple[object, ...]]]()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        try:
+            while True:
+                message = pickle.load(sys.stdin.buffer)
+                if message is None:
+                    self._given_up = True
+                else:
+                    self._waiting.put(message)
+        finally:  # whoever waits for the answers is gone
+            os._exit(1)
+
+    def is_given_up(self) -> bool:
+        return self._given_up
+
+    def next(self) -> tuple[Callable[..., Any], tuple[object, ...]]:
+        return self._waiting.get()
+
+
+_outputs: list[BinaryIO] = []  # where the answers go, in a process that does such work
+
+
+def reply(answer: object) -> None:
+    """Send the answer of the work under way. Whoever does so from another thread ends the process then."""
+    pickle.dump(answer, _outputs[0])
+    _outputs[0].flush()
+
+
+def serves() -> bool:
+    """Whether this process does such work."""
+    return bool(_outputs)
+
+
+def serve() -> None:
+    """Do the work that comes in, and send what comes of it, until the input ends."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # they are meant for the process that waits for this one, which says what is to end
+    output = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # nothing else is written there
+    output.write(_BEGIN)
+    output.flush()
+    _outputs.append(output)
+    pieces = _Work()
+    while True:
+        work, arguments = pieces.next()
+        reply(work(*arguments, pieces.is_given_up))

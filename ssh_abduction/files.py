@@ -1,0 +1,138 @@
+"""Files that nobody has checked yet are read, and files are written so that they appear whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import stat
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+DEEPEST = 100  # objects and lists within each other: Python's own functions for values fail where there are thousands of them
+LONGEST_NUMBER = 100  # digits of a whole number: longer ones cannot be made into floating-point numbers
+_LONG_NUMBER = re.compile(rf"\d{{{LONGEST_NUMBER + 1}}}")
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
+_UNSEEN = re.compile("[\x7f-\x9f\u2028\u2029]")  # control characters that JSON need not escape, and that terminals obey
+
+
+class NotFinite(ValueError):  # noqa: N818 - part of an error message, which the caller completes
+    """JSON in which NaN or Infinity stands for a number. `field` says where."""
+
+    def __init__(self, field: str, text: str) -> None:
+        super().__init__(f"{text} in {field}" if field else text)
+        self.field, self.text = field, text
+
+
+class HalfCharacter(ValueError):  # noqa: N818 - part of an error message, which the caller completes
+    """JSON in which one half of a surrogate pair stands alone: no encoding can write it again."""
+
+
+def parse_json(text: str) -> Any:
+    """The value of a JSON text that can be relied on: no field is given twice, numbers are finite and not endless, texts can be
+    written again, and nothing is nested more than DEEPEST times.
+
+    Raises json.JSONDecodeError for broken JSON, NotFinite, HalfCharacter, and ValueError with what was got instead of sound JSON.
+    """
+    not_finite: list[str] = []
+
+    def constant(name: str) -> float:
+        not_finite.append(name)
+        return math.nan
+
+    try:
+        numbers = {"parse_int": _integer} if _LONG_NUMBER.search(text) else {}
+        value = json.loads(text, object_pairs_hook=_object, parse_constant=constant, **numbers)  # type: ignore[arg-type]
+    except RecursionError:
+        raise ValueError("one nested too deeply; flatten it") from None
+    if text.count("[") + text.count("{") > DEEPEST and _is_deep(value):
+        raise ValueError("one nested too deeply; flatten it")
+    if not_finite:
+        raise NotFinite(_where_nan(value), not_finite[0])
+    if _SURROGATE.search(text):
+        try:
+            json.dumps(value, ensure_ascii=False).encode("utf-8")
+        except UnicodeEncodeError as error:
+            raise HalfCharacter(f"half a character, \\u{ord(error.object[error.start]):04x}; mend it") from None
+    return value
+
+
+def json_line(value: Any) -> str:
+    """A value as JSON on one line. Characters that would steer a terminal are escaped. Raises TypeError or ValueError."""
+    return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", json.dumps(value, ensure_ascii=False, allow_nan=False))
+
+
+def read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
+    """The bytes of a file. Raises OSError, and ValueError where there are more than `most`, as of a device that never ends."""
+    with Path(path).open("rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise ValueError(f"expected at most {most // 2**20} MiB, got more")
+    return data
+
+
+def write_file(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write a file, which appears whole or not at all, with the permissions of the file that it replaces.
+
+    Nothing but a regular file is ever replaced: through a symbolic link its target is written, and a device or a pipe takes the bytes.
+    Raises OSError, and ValueError for a text that is no path.
+    """
+    if not os.fspath(path):
+        raise ValueError("expected the name of a file, got an empty text")
+    try:
+        mode: int | None = os.stat(path).st_mode
+    except FileNotFoundError:
+        mode = None
+    target = Path(os.path.realpath(path))
+    if mode is not None and not (stat.S_ISREG(mode) and target.exists() and target.samefile(path)):
+        Path(path).write_bytes(data)
+        return
+    draft = target.with_name(f".{os.getpid()}-{threading.get_ident():x}.part")  # short, as the target's name may be as long as names can be
+    try:
+        draft.write_bytes(data)
+        if mode is not None:
+            draft.chmod(stat.S_IMODE(mode))
+        draft.replace(target)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in fields if names.count(name) > 1)
+        raise ValueError(f"the field {twice[:60]!r} twice; keep one of them")
+    return fields
+
+
+def _integer(text: str) -> int:
+    if len(text) > LONGEST_NUMBER:
+        raise ValueError(f"a number of more than {LONGEST_NUMBER} digits; shorten it")
+    return int(text)
+
+
+def _is_deep(value: Any) -> bool:
+    """Whether more than DEEPEST objects and lists are within each other."""
+    level = [value]
+    for _ in range(DEEPEST + 1):
+        inside = (item.values() if isinstance(item, dict) else item for item in level if isinstance(item, dict | list))
+        level = [item for items in inside for item in items if isinstance(item, dict | list)]
+        if not level:
+            return False
+    return True
+
+
+def _where_nan(value: Any, path: str = "") -> str:
+    """The field in which a value that is no number stands."""
+    inside: Iterable[tuple[Any, Any]] = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, item in inside:
+        here = f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}" if path else str(key)
+        if isinstance(item, float) and math.isnan(item):
+            return here
+        if isinstance(item, dict | list) and (deeper := _where_nan(item, here)):
+            return deeper
+    return ""

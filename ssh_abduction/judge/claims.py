@@ -1,0 +1,137 @@
+"""Compares what a file of maps says of itself with the maps and the proof that are in it.
+
+>>> from ssh_abduction.judge.claims import false_claims
+>>> from ssh_abduction.maps import DState, SSHMap
+>>> from ssh_abduction.theory.theory import Theory
+>>> one = SSHMap((0,), (DState(0, "a"),), ())
+>>> false_claims({"status": "optimal", "count": 2, "bound": {"dstates": 1}}, [one], 1, Theory.causal(), 1)
+('count: expected 1, as so many maps are listed, got 2',)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from ssh_abduction.errors import brief, is_whole
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.theory.theory import COUNTS, Theory
+
+STATUSES = ("optimal", "feasible", "unsatisfiable", "unknown")
+
+
+def false_claims(answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int) -> tuple[str, ...]:
+    """What is wrong with the claims of an answer, as `solve --json` prints it (docs/formats.md), a sentence each. Nothing of it is believed.
+
+    maps    the maps that it lists
+    steps   how many steps the trace has
+    theory  the theory that the answer is of, resolved
+    proven  the number of dstates that its certificate proves, with clingo's verdict
+    """
+    claims = _Claims(answer, maps, steps, theory, proven)
+    return tuple(fault for check in (claims.sizes, claims.twice, claims.status, claims.cost, claims.bound) for fault in check())
+
+
+class _Claims:
+    def __init__(self, answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int) -> None:
+        self.answer, self.maps, self.steps, self.theory, self.proven = answer, maps, steps, theory, proven
+        self.counts = [_counts(ssh_map) for ssh_map in maps]
+        self.first = next(iter(theory.priorities), None)
+        self.is_optimal = answer.get("status") == "optimal"
+
+    def sizes(self) -> Iterator[str]:
+        """How many steps and maps there are."""
+        listed = len(self.maps)
+        if "count" in self.answer and not _is(self.answer["count"], listed):
+            yield f"count: expected {listed}, as so many maps are listed, got {brief(self.answer['count'])}"
+        if "steps" in self.answer and not _is(self.answer["steps"], self.steps):
+            yield f"steps: expected {self.steps}, as the trace has so many, got {brief(self.answer['steps'])}"
+        prefix = self.answer.get("prefix", 0)
+        if not is_whole(prefix) or not 0 <= prefix <= self.steps:
+            yield f"prefix: expected 0 to {self.steps}, as the trace has so many steps, got {brief(prefix)}"
+
+    def twice(self) -> Iterator[str]:
+        """Each map is listed once."""
+        seen: dict[SSHMap, int] = {}
+        for i, ssh_map in enumerate(self.maps):
+            first = seen.setdefault(ssh_map.renumbered(), i)
+            if first < i:
+                yield f"maps: expected each map once, got maps {first + 1} and {i + 1}, which are the same up to renaming"
+
+    def status(self) -> Iterator[str]:
+        """What is said to be known, and why the search ended."""
+        status, complete, stopped = (self.answer.get(name) for name in ("status", "complete", "stopped"))
+        if "status" in self.answer:
+            if status not in STATUSES:
+                yield f"status: expected one of {', '.join(STATUSES)}, got {brief(status)}"
+            elif bool(self.maps) != (status in ("optimal", "feasible")):
+                expected = "optimal or feasible, as there is a map" if self.maps else "unsatisfiable or unknown, as there is no map"
+                yield f"status: expected {expected}, got {status}"
+            elif status == "feasible" and len(self.maps) > 1:
+                yield f"maps: expected one, as the status is feasible, got {len(self.maps)}"
+        if "complete" not in self.answer:
+            return
+        if not isinstance(complete, bool):
+            yield f"complete: expected true or false, got {brief(complete)}"
+        elif complete and status in ("feasible", "unknown"):
+            yield f"complete: expected false, as the status is {status}, got true"
+        elif complete and self.maps and stopped is not None:
+            yield f"complete: expected false, as the search was stopped ({brief(stopped)}), got true"
+        elif not complete and status == "unsatisfiable":
+            yield "complete: expected true, as the status is unsatisfiable, got false"
+
+    def cost(self) -> Iterator[str]:
+        """The counts of the first map, and that the others are as good."""
+        if "cost" in self.answer:
+            cost = self.answer["cost"]
+            expected = {k: v for k, v in self._least(cost).items() if v or k != "excuses"} if self.maps else None
+            whole = isinstance(cost, Mapping) and all(is_whole(value) for value in cost.values())
+            if cost != expected or (expected is not None and not whole):
+                because = "as map 1 has these" if self.maps else "as there is no map"
+                yield f"cost: expected {_text(expected)}, {because}, got {_text(cost)}"
+        if self.theory.without:
+            return  # the maps need not show the counts of what they are not bound to
+        best = [counts[name] for counts in self.counts[:1] for name in self.theory.priorities]
+        for i, counts in enumerate(self.counts):
+            here = [counts[name] for name in self.theory.priorities]
+            if here != best:
+                preferred = ", ".join(self.theory.priorities)
+                yield f"maps: expected equal numbers of {preferred}, as minimal maps have, got {best} in map 1 and {here} in map {i + 1}"
+
+    def _least(self, cost: Any) -> dict[str, int]:
+        """The counts of the first map. Where axioms are left out, clingo may count more of what is preferred than the map can show."""
+        shown = self.counts[0]
+        if not self.theory.without or not isinstance(cost, Mapping):
+            return shown
+        more = {k: cost[k] for k in self.theory.priorities if is_whole(cost.get(k)) and cost[k] >= shown[k]}
+        return shown | more
+
+    def bound(self) -> Iterator[str]:
+        """Lower bounds: no map is below one, the certificate bears out the one on dstates, and a proof leaves nothing between bound and cost."""
+        bound = self.answer.get("bound", {})
+        if not isinstance(bound, Mapping) or not all(name in COUNTS and is_whole(value) and value >= 0 for name, value in bound.items()):
+            yield f"bound: expected numbers of {', '.join(COUNTS)}, got {brief(bound)}"
+            return
+        for name, value in bound.items():
+            below = [i for i, counts in enumerate(self.counts) if counts[name] < value]
+            if below and not self.theory.without:
+                yield f"bound: expected at most {self.counts[below[0]][name]} {name}, as map {below[0] + 1} has no more, got {value}"
+        if bound.get("dstates", 0) > self.proven:
+            yield f"bound: expected at most {self.proven} dstates, as the certificate proves no more, got {bound['dstates']}"
+        if self.is_optimal and self.maps and self.first and not self.theory.without and "bound" in self.answer:
+            least = self.counts[0][self.first]
+            if bound.get(self.first, 0) < least:
+                got = bound.get(self.first, "none")
+                yield f"bound: expected {least} {self.first}, the cost of map 1, as the status is optimal, got {got}"
+
+
+def _counts(ssh_map: SSHMap) -> dict[str, int]:
+    return {"dstates": len(ssh_map.dstates), "places": len(ssh_map.places), "paths": len(ssh_map.paths), "excuses": len(ssh_map.excused)}
+
+
+def _is(value: Any, number: int) -> bool:
+    return is_whole(value) and value == number
+
+
+def _text(counts: Any) -> str:
+    return ", ".join(f"{value} {name}" for name, value in counts.items()) if isinstance(counts, Mapping) and counts else brief(counts)

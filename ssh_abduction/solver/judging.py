@@ -1,0 +1,91 @@
+"""The second net: maps pass the checker, which shares nothing with the encodings, before they are answers.
+
+To check each step of a long replay, or each map of a long list, would take longer than to find them. So checking has a tenth of the time of the search:
+the first maps are checked always, by the steps that clingo was given at least; of what comes after, as many as that share allows.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+
+from ssh_abduction.errors import SolverError
+from ssh_abduction.judge.checker import Violation, check
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Trace
+
+SHARE = 0.1  # of the time of the search, at most, is spent on checking what is not checked always
+ALWAYS = 3  # maps that are checked however long that takes, by a prefix at least
+SAMPLE = 1000  # steps beyond the prefix that are looked at where there is no time for all of them
+UNSHOWN = frozenset(
+    {"one_place", "one_course", "one_heading"}
+)  # without these a map shows one of several places, courses or headings of a dstate
+
+
+class InternalError(SolverError):
+    """A map that was found breaks an axiom: a defect of this program, and not of the trace."""
+
+
+class Judging:
+    """Passes the maps of one search through the checker.
+
+    trace   the whole trace
+    theory  with star settled
+    """
+
+    def __init__(self, trace: Trace, theory: Theory) -> None:
+        self._trace = trace
+        self._theory = theory
+        self._judged = 0
+        self._seconds = 0.0  # spent so far
+        self._a_step = 0.0  # seconds that a step takes, by the last check
+        self._shown = not UNSHOWN & theory.given_up
+
+    def pass_map(self, ssh_map: SSHMap, prefix: int, elapsed: float) -> None:
+        """Raise InternalError where a map of the whole trace breaks an axiom, as far as there is time to look.
+
+        prefix   how many of the first steps clingo was given
+        elapsed  seconds that the search took so far
+        """
+        if not self._shown:
+            return
+        steps = len(self._trace)
+        allowed = SHARE * elapsed - self._seconds
+        if self._a_step * steps <= allowed or (self._judged < ALWAYS and steps <= prefix):
+            self._check(ssh_map, steps)
+        elif self._judged < ALWAYS:
+            self._check(_of_first_steps(ssh_map, prefix), prefix)
+            self._look_at_sample(ssh_map, prefix)
+        self._judged += 1
+
+    def _check(self, ssh_map: SSHMap, steps: int) -> None:
+        began = time.perf_counter()
+        violations = check(self._trace.prefix(steps), ssh_map, self._theory.of_steps(0, steps))
+        spent = time.perf_counter() - began
+        self._seconds += spent
+        self._a_step = spent / steps
+        if violations:
+            self._fail(violations[0])
+
+    def _look_at_sample(self, ssh_map: SSHMap, prefix: int) -> None:
+        """Look at some links and views beyond the prefix."""
+        links = set(ssh_map.links)
+        beyond = range(prefix, len(self._trace))
+        for t in random.Random(0).sample(beyond, min(SAMPLE, len(beyond))):
+            here, there = ssh_map.labels[t - 1], ssh_map.labels[t]
+            action = self._trace.steps[t - 1].action
+            if action is None or (here, action.name, there) not in links or ssh_map.dstates[there].view != self._trace.steps[t].view:
+                self._fail(Violation("map_explains_trace", (t - 1, t), f"Step {t} is not where the map says."))
+
+    def _fail(self, violation: Violation) -> None:
+        where = f" at step {violation.steps[-1]}" if violation.steps else ""
+        raise InternalError(
+            f"internal error: a map that was found breaks {violation.axiom}{where} (trace {self._trace.digest}): {violation.message} "
+            "This is a defect of ssh-abduction, not of the trace; please report it with the trace, and try --without-speedups prefixes,names,ways"
+        )
+
+
+def _of_first_steps(ssh_map: SSHMap, steps: int) -> SSHMap:
+    """A map of the whole trace whose dstates and links the first steps show all, as a map of these."""
+    return SSHMap(ssh_map.labels[:steps], ssh_map.dstates, ssh_map.links, ssh_map.places, ssh_map.paths, ssh_map.excused)

@@ -1,0 +1,111 @@
+"""How a search ended: statuses, bounds, and the solution, all frozen values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+from ssh_abduction.asp.limits import Stop
+from ssh_abduction.engines.base import Cost
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.steps.certificate import Certificate, Evidence
+from ssh_abduction.steps.noise import LEAST, Noise
+from ssh_abduction.theory.theory import Theory
+
+
+class Status(Enum):
+    """What is known about the trace."""
+
+    OPTIMAL = "optimal"  # minimal maps, proven
+    FEASIBLE = "feasible"  # a map of the whole trace and a bound, but no proof that it is minimal
+    UNSATISFIABLE = "unsatisfiable"  # no map satisfies the axioms, proven
+    UNKNOWN = "unknown"  # stopped before any map of the whole trace was found
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """Lower bounds, proven, on the counts of every map of the trace; None where nothing is proven.
+
+    The order of preference proves a bound on the count that goes first; a search that was stopped also counts the steps that cannot be one
+    dstate (apart.py). The counts after the first are bounded only among the maps
+    that are minimal in what goes before: those bounds are in Solution.cost once the status is optimal.
+    """
+
+    dstates: int | None = None
+    places: int | None = None
+    paths: int | None = None
+    excuses: int | None = None
+
+    def to_dict(self) -> dict[str, int]:
+        counts = {"dstates": self.dstates, "places": self.places, "paths": self.paths, "excuses": self.excuses}
+        return {k: v for k, v in counts.items() if v is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class Seconds:
+    """Wall-clock time: in all, for grounding, and for solving."""
+
+    total: float
+    ground: float
+    solve: float
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a search is: the prefix it works on, the best cost and the bound so far, and the maps found."""
+
+    prefix: int
+    steps: int
+    cost: Cost | None
+    bound: Bound
+    maps: int
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The answer for one trace.
+
+    maps       minimal maps (status optimal), or the best one found (feasible)
+    cost       the counts of the first of these maps; None where there is none. All share the counts that the theory prefers
+    bound      proven lower bounds on the counts of any map
+    complete   no further minimal map exists
+    theory     the theory, with star settled
+    steps      length of the trace
+    prefix     how many of its first steps had to be given to clingo
+    stopped    why the search ended before it was complete, else None
+    evidence   what the certificate is made from; None where the theory is without an axiom that this rests on
+    partial    where no map of the whole trace was found: the best map of its first steps
+    """
+
+    status: Status
+    maps: tuple[SSHMap, ...]
+    cost: Cost | None
+    bound: Bound
+    complete: bool
+    theory: Theory
+    steps: int
+    prefix: int
+    seconds: Seconds
+    evidence: Evidence | None = field(default=None, repr=False)
+    stopped: Stop | None = None
+    partial: SSHMap | None = None
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """Why no map has fewer dstates. Worked out when it is first asked for; None where there is no evidence."""
+        return self.evidence.certificate if self.evidence else None
+
+    @property
+    def noise(self) -> Noise | None:
+        """The step that looks like noise, as nearly all steps before it are dstates of their own because of it alone; None where none does.
+
+        Worked out when it is first asked for.
+        """
+        few = self.cost is not None and self.cost.dstates <= LEAST
+        return None if few or self.status is Status.UNSATISFIABLE or self.evidence is None else self.evidence.noise
+
+    @property
+    def count(self) -> int:
+        """How many maps are listed."""
+        return len(self.maps)

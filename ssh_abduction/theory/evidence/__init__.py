@@ -1,0 +1,33 @@
+"""What is known besides views and actions. A kind of evidence is a module of this folder, and an encoding of the same name.
+
+>>> from ssh_abduction import Theory, Trace
+>>> from ssh_abduction.theory.evidence import pairs_of
+>>> trace = Trace.from_steps("aaa", ["travel", "travel"])
+>>> pairs_of(trace, Theory(different=[(0, 2)])).apart
+{2: frozenset({0})}
+
+`KINDS` lists the kinds; nothing else knows them by name. What a kind says of pairs of steps is wired in where engines make the domains of their
+variables (`Pairs`), so that evidence makes solving faster. What it finds out only once there is a map is asked by one loop (`refuse`).
+"""
+
+from __future__ import annotations
+
+from ssh_abduction.theory.evidence.asserted import Asserted
+from ssh_abduction.theory.evidence.protocol import Equality, Evidence
+from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Trace
+
+KINDS: tuple[type[Evidence], ...] = (Asserted,)
+
+__all__ = ["KINDS", "NO_PAIRS", "Asserted", "Equality", "Evidence", "Pairs", "evidence_of", "pairs_of"]
+
+
+def evidence_of(theory: Theory) -> tuple[Evidence, ...]:
+    """The kinds of evidence that take part in a theory, made for it."""
+    return tuple(kind.of(theory) for kind in KINDS if kind.name in theory.axioms)
+
+
+def pairs_of(trace: Trace, theory: Theory) -> Pairs:
+    """What all evidence says of pairs of steps of a trace."""
+    return Pairs.joined([evidence.pairs(trace) for evidence in evidence_of(theory)])

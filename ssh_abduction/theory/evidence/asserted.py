@@ -1,0 +1,35 @@
+"""What a person says of steps: that two are one dstate, that two are not, or that two are not even at one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.theory.evidence.protocol import Equality
+from ssh_abduction.theory.pairs import Pairs
+from ssh_abduction.trace import Trace
+
+if TYPE_CHECKING:
+    from ssh_abduction.theory.theory import Theory
+
+
+@dataclass(frozen=True)
+class Asserted:
+    """The fields `same`, `different` and `elsewhere` of a theory. Pairs with a step that the trace does not have (yet) say nothing."""
+
+    name: ClassVar[str] = "asserted"
+    said: Pairs
+
+    @classmethod
+    def of(cls, theory: Theory) -> Asserted:
+        return cls(theory.asserted)
+
+    def pairs(self, trace: Trace) -> Pairs:
+        return self.said
+
+    def facts(self, trace: Trace, start: int, stop: int) -> str:
+        return ""
+
+    def refuse(self, trace: Trace, ssh_map: SSHMap) -> frozenset[Equality] | None:
+        return None

@@ -1,0 +1,45 @@
+"""What a kind of evidence has to offer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Protocol
+
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.theory.pairs import Pairs
+from ssh_abduction.trace import Trace
+
+if TYPE_CHECKING:
+    from ssh_abduction.theory.theory import Theory
+
+
+@dataclass(frozen=True)
+class Equality:
+    """That two steps are at one dstate, or at one place."""
+
+    first: int
+    second: int
+    of: str = "dstate"
+
+
+class Evidence(Protocol):
+    """A kind of evidence. encodings/NAME.lp holds its axiom, which has the same name, and says with `if` for which theories it holds."""
+
+    name: ClassVar[str]
+
+    @classmethod
+    def of(cls, theory: Theory) -> Evidence:
+        """What takes part in a theory."""
+        ...
+
+    def pairs(self, trace: Trace) -> Pairs:
+        """What is known of pairs of steps before the search. A map of the trace, cut down to some first steps, keeps what is said of these."""
+        ...
+
+    def facts(self, trace: Trace, start: int, stop: int) -> str:
+        """What else its encoding reads, of steps `start` to `stop - 1`."""
+        ...
+
+    def refuse(self, trace: Trace, ssh_map: SSHMap) -> frozenset[Equality] | None:
+        """A small set of equalities of a map of the first steps that cannot all hold, whatever the map; None if there is none."""
+        ...

@@ -1,0 +1,82 @@
+"""What is known of pairs of steps before any map is sought."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TypeAlias
+
+Earlier: TypeAlias = Mapping[int, frozenset[int]]  # of a step, the earlier steps that it makes a pair with
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """What is known of pairs of steps before any map is sought. Each mapping leads from a step to earlier steps.
+
+    apart      they are not one dstate; these include all that are elsewhere
+    elsewhere  they are not at one place
+    one        they are one dstate
+    """
+
+    apart: Earlier = field(default_factory=dict)
+    elsewhere: Earlier = field(default_factory=dict)
+    one: Earlier = field(default_factory=dict)
+
+    @staticmethod
+    def of(apart: Iterable[tuple[int, int]] = (), elsewhere: Iterable[tuple[int, int]] = (), one: Iterable[tuple[int, int]] = ()) -> Pairs:
+        """The same from pairs in any order."""
+        away = list(elsewhere)
+        return Pairs(_earlier([*apart, *away]), _earlier(away), _earlier(one))
+
+    @staticmethod
+    def joined(several: Sequence[Pairs]) -> Pairs:
+        """What several kinds of evidence say together."""
+        if len(several) <= 1:
+            return several[0] if several else NO_PAIRS
+        return Pairs.of(*([pair for pairs in several for pair in pairs_in(getattr(pairs, name))] for name in ("apart", "elsewhere", "one")))
+
+    def __bool__(self) -> bool:
+        return bool(self.apart or self.one)
+
+    @cached_property
+    def asked_for(self) -> frozenset[int]:
+        """The steps about which something is known once they are there."""
+        return frozenset((*self.apart, *self.one))
+
+    def allow(self, step: int, labels: Sequence[int], place_of: Sequence[int | None] | None = None) -> bool:
+        """Whether a step may be at the dstate that `labels` gives it, as far as it makes pairs with earlier steps.
+
+        place_of  the place of each dstate, where that is known
+        """
+        if step not in self.asked_for:
+            return True
+        here = labels[step]
+        if any(labels[other] == here for other in self.apart.get(step, ())):
+            return False
+        if any(labels[other] != here for other in self.one.get(step, ())):
+            return False
+        if not place_of or place_of[here] is None:
+            return True
+        return all(place_of[labels[other]] != place_of[here] for other in self.elsewhere.get(step, ()))
+
+    def broken_by(self, labels: Sequence[int]) -> list[tuple[int, int]]:
+        """The pairs of these first steps that labels make one dstate, or do not, against what is known."""
+        size = len(labels)
+        wrong = [(i, t) for i, t in pairs_in(self.apart) if t < size and labels[i] == labels[t]]
+        return wrong + [(i, t) for i, t in pairs_in(self.one) if t < size and labels[i] != labels[t]]
+
+
+def pairs_in(earlier: Earlier) -> list[tuple[int, int]]:
+    """The pairs of a mapping: the earlier step, and the later one."""
+    return [(i, t) for t, others in earlier.items() for i in others]
+
+
+def _earlier(pairs: Iterable[tuple[int, int]]) -> dict[int, frozenset[int]]:
+    found: dict[int, set[int]] = {}
+    for i, j in pairs:
+        found.setdefault(max(i, j), set()).add(min(i, j))
+    return {t: frozenset(others) for t, others in found.items()}
+
+
+NO_PAIRS = Pairs()

@@ -1,0 +1,169 @@
+"""What a file of maps says of itself: true of all that solve prints, and each lie is named."""
+
+from __future__ import annotations
+
+import copy
+import json
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from worlds import TOURS, drive, rectangle
+
+from ssh_abduction import SSHMap, Trace
+from ssh_abduction.cli import main
+
+ACES = str(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
+
+
+def answer(trace: str, capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+    main(["solve", trace, "--json", *words])
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def check(trace: str, data: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
+    (folder / "maps.json").write_text(json.dumps(data))
+    code = main(["check", "--bound", trace, str(folder / "maps.json"), *words])
+    return code, capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "",
+        "-n 2",
+        "--time-limit 1e-9",
+        "--time-limit 1e-9 --without-speedups greedy",
+        "--theory circumscriptive",
+        "--theory causal",
+        "--boundary none --path-order partial --prefer paths,places,dstates",
+        "--boundary defeasible",
+        "--boundary defeasible --prefer dstates,excuses",
+        "--prefer places",
+        "--prefer= -n 3",
+        "--without on_path -n 3",
+        "--without path_order_total,order_asymmetric --prefer paths -n 3",
+    ],
+)
+@pytest.mark.parametrize("tour", ["square", "tee", "comb"])
+def test_what_solve_prints_is_true(tour: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(tmp_path / "trace.jsonl")
+    drive(*TOURS[tour]).save(path)
+    code, out = check(path, answer(path, capsys, *words.split()), tmp_path, capsys)
+    assert code == 0, out
+
+
+def test_that_there_is_no_map_is_no_lie(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(tmp_path / "trace.jsonl")
+    Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"]).save(path)
+    data = answer(path, capsys)
+    assert data["status"] == "unsatisfiable"
+    assert check(path, data, tmp_path, capsys)[0] == 0
+    assert "complete: expected true" in check(path, data | {"complete": False}, tmp_path, capsys)[1]
+
+
+LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = {
+    "more maps than listed": ({"count": 5}, "count: expected 4, as so many maps are listed, got 5"),
+    "true is no number": ({"count": True}, "count: expected 4, as so many maps are listed, got True"),
+    "fewer maps than listed": (lambda d: d["maps"].pop(), "count: expected 3, as so many maps are listed, got 4"),
+    "a map twice": (lambda d: d["maps"].append(d["maps"][1]), "maps: expected each map once, got maps 2 and 5, which are the same"),
+    "another trace": ({"steps": 22}, "steps: expected 23, as the trace has so many, got 22"),
+    "a prefix longer than the trace": ({"prefix": 99}, "prefix: expected 0 to 23"),
+    "a smaller cost": (
+        lambda d: d["cost"].update(dstates=18),
+        "cost: expected 19 dstates, 10 places, 4 paths, as map 1 has these, got 18 dstates",
+    ),
+    "a cost of what is not preferred": (
+        lambda d: d["cost"].update(excuses=1),
+        "cost: expected 19 dstates, 10 places, 4 paths, as map 1 has these",
+    ),
+    "no cost": ({"cost": None}, "cost: expected 19 dstates, 10 places, 4 paths, as map 1 has these, got None"),
+    "a cost of another type": ({"cost": [19]}, "cost: expected 19 dstates, 10 places, 4 paths, as map 1 has these, got [19]"),
+    "a bound above the cost": ({"bound": {"dstates": 20}}, "bound: expected at most 19 dstates, as map 1 has no more, got 20"),
+    "a bound that is not proven": (
+        lambda d: d["certificate"]["refuted"].pop(),
+        "bound: expected at most 18 dstates, as the certificate proves no more, got 19",
+    ),
+    "optimal, and a bound below": (
+        {"bound": {"dstates": 12}},
+        "bound: expected 19 dstates, the cost of map 1, as the status is optimal, got 12",
+    ),
+    "optimal, and no bound": ({"bound": {}}, "bound: expected 19 dstates, the cost of map 1, as the status is optimal, got none"),
+    "a bound of another type": ({"bound": {"dstates": "19"}}, "bound: expected numbers of dstates, paths, places, excuses, got"),
+    "a bound of something else": ({"bound": {"rooms": 1}}, "bound: expected numbers of dstates, paths, places, excuses, got"),
+    "no such status": ({"status": "perfect"}, "status: expected one of optimal, feasible, unsatisfiable, unknown, got 'perfect'"),
+    "a status of another type": ({"status": [1]}, "status: expected one of optimal, feasible, unsatisfiable, unknown, got [1]"),
+    "no map, though there are some": (
+        {"status": "unsatisfiable"},
+        "status: expected optimal or feasible, as there is a map, got unsatisfiable",
+    ),
+    "without proof, though there are several": ({"status": "feasible"}, "maps: expected one, as the status is feasible, got 4"),
+    "complete without proof": ({"status": "feasible"}, "complete: expected false, as the status is feasible, got true"),
+    "complete, though stopped": ({"stopped": "maps limit"}, "complete: expected false, as the search was stopped ('maps limit'), got true"),
+    "complete of another type": ({"complete": 1}, "complete: expected true or false, got 1"),
+    "optimal without a map": ({"maps": []}, "status: expected unsatisfiable or unknown, as there is no map, got optimal"),
+}
+
+
+@pytest.mark.parametrize("case", LIES)
+def test_a_lie_is_named(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change, line = LIES[case]
+    data = copy.deepcopy(answer(ACES, capsys))
+    if callable(change):
+        change(data)
+    else:
+        data |= change
+    code, out = check(ACES, data, tmp_path, capsys)
+    assert code == 20
+    assert any(shown.startswith(line) for shown in out.splitlines()), out
+
+
+def test_maps_that_are_not_equally_good_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(tmp_path / "trace.jsonl")
+    rectangle(24).save(path)
+    data = answer(path, capsys, "--boundary", "none")
+    worse = answer(path, capsys)["maps"][0]
+    data["maps"].append(worse)
+    data["count"] += 1
+    code, out = check(path, data, tmp_path, capsys)
+    assert code == 20
+    assert "maps: expected equal numbers of dstates, paths, places, as minimal maps have, got [4, " in out
+
+
+def test_a_map_under_other_numbers_is_the_same_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = answer(ACES, capsys)
+    rng = random.Random(0)
+    for original in [SSHMap.from_dict(m) for m in data["maps"]]:
+        assert original.renumbered() == original
+        for _ in range(20):
+            other = SSHMap.from_dict(_renamed(original.to_dict(), rng))
+            assert other.renumbered() == original
+            assert other.renumbered().paths == original.paths
+    data["maps"][3] = _renamed(data["maps"][0], rng)
+    code, out = check(ACES, data, tmp_path, capsys)
+    assert code == 20
+    assert "maps: expected each map once, got maps 1 and 4, which are the same up to renaming\n" in out
+
+
+def _renamed(data: dict[str, Any], rng: random.Random) -> dict[str, Any]:
+    """The same map with other numbers, and some paths in the other direction."""
+    data = copy.deepcopy(data)
+    dstate, place, path = (
+        {x: i for i, x in enumerate(rng.sample(range(n), n))} for n in map(len, (data["dstates"], data["places"], data["paths"]))
+    )
+    flipped = {p["id"] for p in data["paths"] if rng.random() < 0.5}
+    for s in data["dstates"]:
+        if s["path"] in flipped:
+            s["direction"] *= -1
+        s["id"], s["place"], s["path"] = dstate[s["id"]], place.get(s["place"]), path.get(s["path"])
+    data["dstates"].sort(key=lambda s: s["id"])
+    data["labels"] = [dstate[s] for s in data["labels"]]
+    data["links"] = [[dstate[s], action, dstate[x]] for s, action, x in data["links"]]
+    for p in data["paths"]:
+        order = [place[q] for q in p["order"]]
+        p["id"], p["order"] = path[p["id"]], order[::-1] if p["id"] in flipped else order
+    rng.shuffle(data["links"])
+    return data

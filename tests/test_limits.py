@@ -1,0 +1,275 @@
+"""Limits are promises: time, memory, Ctrl-C and SIGTERM are heeded whatever clingo is at, and what is known by then is printed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from limits import Case, cases, outcome
+from worlds import rectangle
+
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.asp.control import Control
+from ssh_abduction.asp.limits import Stopped, Watch, peak_memory
+from ssh_abduction.cli import workers
+from ssh_abduction.judge.proof import check_bound
+from ssh_abduction.steps import certificate
+from ssh_abduction.steps.noise import noise_in
+
+SLACK = 1.5  # times as long as is promised, as other tests run at the same time
+JOINS = "p(1..400). { q(X,Y) : p(X), p(Y) }. :- p(X), 1 = @go_on(X), q(X,Y), q(Y,Z), q(Z,X)."  # 64 million rules
+POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals")
+
+# Sits in clingo, which cannot be stopped, under a guard.
+DEAF = """
+import sys, clingo
+from ssh_abduction.cli.guard import Guard
+from ssh_abduction.cli.outcome import on_ctrl_c
+limit, memory = (float(word) or None for word in sys.argv[1:])
+with on_ctrl_c(lambda: None), Guard(lambda: None, lambda why: (f"known: {why}", 10), limit, memory) as guard:
+    guard.say(lambda: "begun, ")
+    print("ready", file=sys.stderr, flush=True)
+    control = clingo.Control()
+    control.add("p(0). p(X+1) :- p(X), X < 1000000000.")
+    control.ground()
+"""
+
+
+@pytest.fixture
+def noisy(tmp_path: Path) -> Path:
+    """Circuits of a rectangle, of which the last view is wrong: as many dstates as steps, and far too many ways to lay streets through them."""
+    trace = rectangle(40)
+    *steps, last = trace.steps
+    path = tmp_path / "noisy.jsonl"
+    replace(trace, steps=(*steps, replace(last, view=steps[-2].view))).save(path)
+    return path
+
+
+def test_grounding_ends_with_the_limit() -> None:
+    watch = Watch(0.5)
+    watch.use_reserve()
+    watch.start()
+    control = Control((), watch.check)
+    control.add("base", [], JOINS)
+    with pytest.raises(Stopped) as caught:
+        control.ground()
+    assert caught.value.reason == "time limit"
+    assert watch.elapsed() < 5
+
+
+def test_what_ends_grounding_is_raised_as_it_is() -> None:
+    error = ValueError("enough", 3)
+
+    def check() -> None:
+        raise error
+
+    control = Control((), check)
+    control.add("base", [], JOINS)
+    with pytest.raises(ValueError, match="enough") as caught:
+        control.ground()
+    assert caught.value is error
+
+
+@pytest.mark.parametrize(("seconds", "mebibytes", "reason"), [(2.0, 0.0, "time limit"), (0.0, 200.0, "memory limit"), (0.0, 0.0, None)])
+def test_what_would_go_beyond_a_limit_is_not_begun(seconds: float, mebibytes: float, reason: str | None) -> None:
+    watch = Watch(1.0, peak_memory() + 100)
+    watch.use_reserve()
+    watch.start()
+    stopped = None
+    try:
+        watch.check(seconds, mebibytes)
+    except Stopped as stop:
+        stopped = stop.reason
+    assert stopped == reason
+
+
+def test_the_search_ends_in_time_with_its_best_map(noisy: Path) -> None:
+    trace = Trace.load(noisy)
+    began = time.monotonic()
+    solution = solve(trace, limit=4)
+    assert time.monotonic() - began < SLACK * (1.2 * 4 + 1)
+    assert solution.stopped == "time limit"
+    assert solution.cost is not None
+    assert solution.cost.dstates == len(trace)
+    assert solution.bound.dstates == len(trace) - 1
+
+
+@pytest.mark.parametrize(
+    "case", list(cases(12, seed=1, longest=300, seconds=(0.5, 1))), ids=lambda case: f"{case.family}, {len(case.trace)} steps"
+)
+@POSIX
+def test_limits_hold_on_traces_with_flaws(case: Case, tmp_path: Path) -> None:
+    found = outcome(case, tmp_path)
+    assert found.status in ("optimal", "feasible", "unsatisfiable", "unknown")
+    assert found.seconds <= SLACK
+    assert found.mebibytes <= 1
+
+
+@POSIX
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("many", [False, True], ids=["one trace", "two at a time"])
+def test_who_is_interrupted_prints_what_is_known(number: int, code: int, many: bool, noisy: Path) -> None:
+    paths = [str(noisy)] * 2 + ["--jobs", "2"] if many else [str(noisy)]
+    command = [sys.executable, "-m", "ssh_abduction", "solve", "--json", *paths]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        time.sleep(5)
+        process.send_signal(number)
+        began = time.monotonic()
+        out, _ = process.communicate(timeout=30)
+    assert time.monotonic() - began < SLACK * 2
+    assert process.returncode == code
+    for line in out.splitlines() if many else [out]:
+        printed = json.loads(line)
+        assert (printed["status"], printed["stopped"], len(printed["maps"])) == ("feasible", "interrupted", 1)
+
+
+@POSIX
+@pytest.mark.parametrize(
+    ("limit", "memory", "number", "why"),
+    [
+        (0.5, 0, None, "time limit"),
+        (0, 50, None, "memory limit"),
+        (0, 0, signal.SIGINT, "interrupted"),
+        (0, 0, signal.SIGTERM, "interrupted"),
+    ],
+)
+def test_the_guard_speaks_while_clingo_does_not_listen(limit: float, memory: float, number: int | None, why: str) -> None:
+    command = [sys.executable, "-c", DEAF, str(limit), str(memory)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr
+        assert process.stderr.readline() == "ready\n"
+        time.sleep(0.2)
+        if number is not None:
+            process.send_signal(number)
+        out, _ = process.communicate(timeout=30)
+    assert (out, process.returncode) == (f"begun, known: {why}", 10)
+
+
+def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:
+    """Answers its number; after so many seconds, or when it is given up."""
+    ends = time.monotonic() + seconds
+    while time.monotonic() < ends and not given_up():
+        time.sleep(0.01)
+    return number
+
+
+def vanish(_: int, path: str, __: Callable[[], bool]) -> None:
+    """Writes which process it is, and ends without an answer."""
+    Path(path).write_text(str(os.getpid()))
+    os._exit(3)
+
+
+def stay(_: int, path: str, __: Callable[[], bool]) -> None:
+    """Writes which process it is, and does not heed anything."""
+    Path(path).write_text(str(os.getpid()))
+    time.sleep(1000)
+
+
+def test_answers_of_workers() -> None:
+    tasks = [(number, 0.0) for number in range(5)]
+    assert sorted(workers.answers(sleep, tasks, 2, lambda: False, None, 1.0)) == [0, 1, 2, 3, 4]
+
+
+def test_a_worker_that_vanishes_or_is_late_loses_its_task_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "STARTING", 2.0)
+    path = str(tmp_path / "pid")
+    assert list(workers.answers(vanish, [(7, path), (8, path)], 1, lambda: False, None, 1.0)) == [
+        workers.Lost(7, False),
+        workers.Lost(8, False),
+    ]
+    assert list(workers.answers(stay, [(9, path)], 1, lambda: False, 0.1, 1.0)) == [workers.Lost(9, True)]
+
+
+def test_what_is_given_up_is_answered_and_nothing_begins() -> None:
+    answers = workers.answers(sleep, [(0, 0.0), (1, 1000.0), (2, 0.0)], 1, lambda: bool(found), None, 20.0)
+    found: list[object] = []
+    found += [next(answers)]
+    assert found + list(answers) in ([0, 1], [0])
+
+
+@POSIX
+def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
+    path = tmp_path / "pid"
+    program = f"from ssh_abduction.cli import workers; from test_limits import stay; list(workers.answers(stay, [(0, {str(path)!r})], 1, bool, None, 1.0))"
+    with subprocess.Popen([sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}) as parent:
+        while not (path.exists() and path.read_text()):
+            assert parent.poll() is None
+            time.sleep(0.01)
+        worker = int(path.read_text())
+        os.kill(worker, 0)
+        parent.kill()
+    deadline = time.monotonic() + 10
+    while is_running(worker):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def is_running(process: int) -> bool:
+    """Whether a process runs; one that has ended may still be listed, where nobody asks how it ended."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{process}/stat")
+    return not status.exists() or status.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+VIEWS = [number % 4 for number in range(201)]
+ACTIONS = [number % 2 for number in range(200)]
+
+
+def with_view(step: int) -> tuple[list[int], list[int]]:
+    """Circuits of which one view is wrong."""
+    return [*VIEWS[:step], (VIEWS[step] + 1) % 4, *VIEWS[step + 1 :]], ACTIONS
+
+
+@pytest.mark.parametrize(
+    ("views", "actions", "step"),
+    [
+        (VIEWS, ACTIONS, None),
+        (*with_view(200), 200),
+        (*with_view(120), 120),
+        (*with_view(30), 30),
+        (*with_view(5), None),
+        (VIEWS[:120] + VIEWS[121:], ACTIONS[:120] + ACTIONS[121:], 120),  # a step left out of the log
+        (VIEWS[:120] + VIEWS[119:], ACTIONS[:120] + ACTIONS[119:], 120),  # a step that is there twice
+        (list(range(30)), [0] * 29, None),  # all is new
+        ([0] * 40 + [1], [0] * 40, None),  # a long corridor, and its end
+    ],
+)
+def test_noise_is_told_from_circuits_and_from_what_is_new(views: list[int], actions: list[int], step: int | None) -> None:
+    noise = noise_in(views, actions)
+    assert (noise and noise.step) == step
+
+
+def test_a_warning_names_the_step(noisy: Path) -> None:
+    command = [sys.executable, "-m", "ssh_abduction", "solve", str(noisy), "--json", "--theory=causal"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    last = len(Trace.load(noisy)) - 1
+    (warning,) = json.loads(done.stdout)["warnings"]
+    assert done.stderr == f"ssh-abduction: warning: {warning}\n"
+    assert warning.startswith(f"{noisy}:{last + 2}: view ")
+    assert (
+        f"looks like noise at step {last}: because of it {last} of the {last + 1} steps up to there have to be dstates of their own"
+        in warning
+    )
+
+
+def test_a_certificate_without_words_is_checked_along_the_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
+    with_words = solve(trace, Theory.causal()).certificate
+    assert with_words is not None
+    monkeypatch.setattr(certificate, "WRITTEN", 0)
+    short = with_words.to_dict(trace)
+    assert "words" not in short
+    assert check_bound(trace, short).faults == ()
+    assert check_bound(trace, {"clique": [0, 1], "refuted": []}).faults == ()
+    assert check_bound(rectangle(8), {"clique": [0, 8], "refuted": []}).faults != ()

@@ -1,0 +1,278 @@
+"""A theory is open: what is added to it is obeyed everywhere, online and in one go, though no speed-up and no checker knows it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+from unittest.mock import patch
+
+import pytest
+from brute_force import Key, key, minimal_maps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import TOYS, Toy, traces
+from worlds import ACTIONS
+
+from ssh_abduction import OnlineMapper, Speedups, SSHMap, Status, Theory, TheoryError, Trace, solve
+from ssh_abduction.engines.causal import NamedEngine
+from ssh_abduction.engines.stepwise import StepEngine
+from ssh_abduction.explain import explain
+from ssh_abduction.judge import check
+from ssh_abduction.judge.checker import unchecked
+from ssh_abduction.solver import search
+from ssh_abduction.solver.judging import InternalError
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs
+from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.speedups import SPEEDUPS, TABLE, row
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+FORGETFUL = Rules(
+    "forgetful.lp",
+    "% @axiom(forgetful) No dstate is seen twice more than 10 steps apart.\n#program step(t).\nviolation(forgetful,t) :- same(I,t), t-I > 10.",
+)
+THEORIES = {"causal": Theory.causal(), "topological": Theory.topological(), "circumscriptive": Theory.circumscriptive()}
+
+
+def with_toy(toy: Toy, theory: Theory) -> Theory:
+    return theory.replace(rules=(toy.rules,))
+
+
+@pytest.mark.parametrize("name", THEORIES)
+@pytest.mark.parametrize("toy", TOYS, ids=lambda toy: toy.rules.name)
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(data=st.data())
+def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.DataObject) -> None:
+    """In one go and step by step, against the brute force; with first prefixes so short that replay would overlook it."""
+    theory = with_toy(toy, THEORIES[name]) if toy.causal or name != "causal" else with_toy(TOYS[0], THEORIES[name])
+    allows = TOYS[0].allows if toy.rules not in theory.rules else toy.allows
+    trace = data.draw(traces(max_steps=6), label="trace")
+    mapper: OnlineMapper | None = None
+    with patch.multiple(search, FIRST_PREFIX=1, FEW_STEPS=0):
+        for steps in range(1, len(trace) + 1):
+            prefix = trace.prefix(steps)
+            counts, expected = minimal_maps(prefix, replace(theory, rules=()), allows)
+            if mapper is None:
+                first = trace.steps[0]
+                assert first.view is not None
+                mapper = OnlineMapper(first.view, theory, star=first.star, limit=None, maps=0)
+                online = mapper.solution
+            else:
+                step, before = trace.steps[steps - 1], trace.steps[steps - 2].action
+                assert step.view is not None
+                assert before is not None
+                online = mapper.observe(before, step.view, star=step.star)
+            for solution in (online, solve(prefix, theory, maps=0)):
+                assert solution.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
+                assert {key(ssh_map) for ssh_map in solution.maps} == expected
+
+
+@pytest.mark.parametrize(("steps", "dstates"), [(24, 16), (61, 53)])
+def test_a_rule_about_pairs_of_steps_on_circuits(steps: int, dstates: int) -> None:
+    trace = Trace.load(EXAMPLES / "notched-rectangle.jsonl").prefix(steps)
+    solution = solve(trace, Theory.causal(), rules=[FORGETFUL])
+    assert solution.status is Status.OPTIMAL
+    assert solution.cost
+    assert solution.cost.dstates == dstates
+
+
+@pytest.fixture
+def wider(tmp_path: Path) -> Iterator[type[Theory]]:
+    """A folder of encodings with one file more, and a theory with one field more: all that somebody does who adds an axiom, and forgets the rest."""
+    folder = tmp_path / "encodings"
+    shutil.copytree(encodings.folder(), folder)
+    (folder / "forgetful.lp").write_text(
+        "% Toy.\n#program step(t).\n% @axiom(forgetful) No dstate is seen twice more than 10 steps apart. [a toy] if forgetful\n"
+        "violation(forgetful,t) :- axiom(forgetful), same(I,t), t-I > 10.\n"
+    )
+
+    @dataclass(frozen=True)
+    class Wider(Theory):
+        forgetful: bool = False
+
+    caches = (encodings.levels, encodings.axioms, encodings.keeps)
+    for cached in caches:
+        cached.cache_clear()
+    with patch.object(encodings, "folder", lambda: folder):
+        yield Wider
+    for cached in caches:
+        cached.cache_clear()
+
+
+def test_an_axiom_put_into_the_encodings_and_the_theory_alone_is_obeyed(wider: type[Theory]) -> None:
+    trace = Trace.load(EXAMPLES / "notched-rectangle.jsonl").prefix(24)
+    causal = wider.causal().replace(forgetful=True)
+    solution = solve(trace, causal)
+    assert (solution.status, solution.cost and solution.cost.dstates) == (Status.OPTIMAL, 16)
+    assert unchecked(causal) == ("forgetful",)
+    mapper = OnlineMapper("v0", causal, limit=None)
+    for step, before in zip(trace.steps[1:], trace.actions, strict=True):
+        assert step.view is not None
+        mapper.observe(before, step.view)
+    assert mapper.solution.cost
+    assert mapper.solution.cost.dstates == 16
+
+
+def test_a_field_that_nothing_speaks_for_switches_off_what_is_exact_for_known_axioms() -> None:
+    @dataclass(frozen=True)
+    class Wider(Theory):
+        penalty: float | None = None
+
+    exact = [speedup for speedup in TABLE if speedup.keeps is not None and speedup.suits(Theory.causal())]
+    assert {speedup.name for speedup in exact} >= {"prefixes", "named dstates"}
+    assert all(speedup.holds_for(Wider.causal()) for speedup in exact)
+    assert not any(speedup.holds_for(Wider.causal().replace(penalty=1.5)) for speedup in exact)
+
+
+def test_every_switch_has_a_row_and_every_row_a_switch() -> None:
+    assert {speedup.switch for speedup in TABLE} == set(SPEEDUPS)
+    for speedup in TABLE:
+        assert row(speedup.name) is speedup
+        assert speedup.sentence.endswith(".")
+        assert speedup.rests_on <= {axiom.name for axiom in encodings.axioms()}
+
+
+@pytest.mark.parametrize("axiom", ["functional_view", "deterministic"])
+def test_what_rests_on_an_axiom_is_off_without_it(axiom: str) -> None:
+    resting = [speedup for speedup in TABLE if axiom in speedup.rests_on]
+    assert len(resting) > 5
+    assert not any(speedup.holds_for(Theory.causal().replace(without=(axiom,))) for speedup in resting)
+
+
+@dataclass(frozen=True)
+class NoLongReturns:
+    """A toy kind of evidence that only a whole map shows: no three steps of one dstate."""
+
+    name: ClassVar[str] = "seldom"
+
+    @classmethod
+    def of(cls, theory: Theory) -> NoLongReturns:
+        return cls()
+
+    def pairs(self, trace: Trace) -> Pairs:
+        return NO_PAIRS
+
+    def facts(self, trace: Trace, start: int, stop: int) -> str:
+        return ""
+
+    def refuse(self, trace: Trace, ssh_map: SSHMap) -> frozenset[Equality] | None:
+        steps: dict[int, list[int]] = {}
+        for t, label in enumerate(ssh_map.labels):
+            if len(found := steps.setdefault(label, [])) == 2:
+                return frozenset({Equality(found[0], found[1]), Equality(found[1], t)})
+            found.append(t)
+        return None
+
+
+@pytest.mark.parametrize("name", THEORIES)
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(data=st.data())
+def test_what_evidence_refuses_of_a_map_is_forbidden(name: str, data: st.DataObject) -> None:
+    """The answer is that of the brute force, whichever maps clingo finds first."""
+    trace = data.draw(traces(max_steps=6), label="trace")
+    named = Rules("seldom.lp", "% @axiom(seldom) No dstate is seen three times.\n")
+    theory = THEORIES[name].replace(rules=(named,))
+
+    def allows(found: Key) -> bool:
+        return all(found[0].count(label) <= 2 for label in found[0])
+
+    counts, expected = minimal_maps(trace, THEORIES[name], allows)
+    with patch.object(search, "evidence_of", lambda _: (NoLongReturns(),)), patch.multiple(search, FIRST_PREFIX=1, FEW_STEPS=0):
+        solution = solve(trace, theory, maps=0)
+    assert solution.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
+    assert {key(ssh_map) for ssh_map in solution.maps} == expected
+
+
+def test_steps_said_to_be_at_one_place_that_cannot_be() -> None:
+    trace = Trace.load(EXAMPLES / "aces3-route.jsonl")
+    at_check = Rules("one.lp", "#program check(t).\n:- query(t), not same_place(5,15).")
+    at_step = Rules("one.lp", "#program step(t).\n:- t = 15, not same_place(5,t).")
+    for choices in ({"same": [(5, 15)]}, {"rules": [at_check]}, {"rules": [at_step]}):
+        assert solve(trace, **choices).status is Status.UNSATISFIABLE  # type: ignore[arg-type]
+
+
+def test_an_explanation_names_assertions_and_own_axioms() -> None:
+    trace = Trace.from_steps("aba", ["travel", "travel"])
+    said = explain(trace, Theory.topological().replace(same=[(0, 1)]))
+    assert said
+    assert {"asserted", "functional_view"} == set(said.axioms)
+    rules = Rules("own.lp", "% @axiom(new) All dstates are seen again.\n#program step(t).\nviolation(new,t) :- t > 0, not same(0,t).")
+    said = explain(trace, Theory.topological().replace(rules=[rules]))
+    assert said
+    assert "new" in said.axioms
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (":- same(I,T), T-I > 10.", r"own\.lp:1: same: expected in a program part of steps, .* #program step\(t\)\."),
+        ("far :- act(0,A).", r"own\.lp:1: act: expected in a program part of steps"),
+        ("#program step(t).\n:- same(I,t) t > 3.", r"own\.lp:2:\d+-\d+: error: syntax error"),
+        ("#program step(t).\n:- same(I,t), X > 3.", r"own\.lp:2.*unsafe"),
+        (
+            "#program step(t).\nviolation(odd,t) :- same(I,t).",
+            r"own\.lp:2: violation\(odd,…\): expected a sentence for it; write % @axiom\(odd\)",
+        ),
+        ("#program step(t).\n:- sameplace(I,t).", r"own\.lp:2: sameplace: expected an atom that this theory has, .*same_place"),
+        ("#program step(t).\nsame(0,t) :- act(t-1,A).", r"own\.lp:2: expected a rule that reads same, got one that defines it"),
+        ("#program steps(t).\n:- same(I,t).", r"own\.lp:1: expected a program part base, step\(t\) or check\(t\)"),
+        ("#program step(t).\n:- not same_place(5,15).", r"own\.lp:2: not same_place\(5,15\): expected to be asked at a step"),
+        ("#minimize { 1,I : same(I,3) }.", r"own\.lp:1: expected rules, got"),
+        ("#show same/2.", r"own\.lp:1: expected rules, got #show"),
+        ("% @axiom(deterministic) Mine.\n", r"own\.lp: @axiom\(deterministic\): expected a name that no other axiom has"),
+    ],
+)
+def test_rules_that_could_never_be_read_say_how_to_write_them(
+    text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.lp").write_text(text)
+    with pytest.raises(TheoryError, match=message) as error:
+        solve(Trace.from_steps("aa", ["travel"]), rules=["own.lp"])
+    assert "\n" not in str(error.value)
+
+
+def test_rules_may_read_facts_and_atoms_of_their_own() -> None:
+    rules = Rules(
+        "own.lp", "#const most = 1.\nlimit(most).\nfar(I,T) :- pair(I,T).\npair(0,2).\n#program step(t).\n:- far(I,t), same(I,t), limit(1)."
+    )
+    assert (
+        solve(Trace.from_steps("aaa", ["right", "right"]), rules=[rules]).cost
+        == solve(Trace.from_steps("aaa", ["right"] * 2), different=[(0, 2)]).cost
+    )
+
+
+def test_a_map_that_breaks_an_axiom_is_an_internal_error() -> None:
+    trace = Trace.from_steps("abab", [ACTIONS["T"]] * 3)
+    found = StepEngine._read
+
+    def wrong(self: StepEngine, model: object) -> object:
+        right = found(self, model)  # type: ignore[arg-type]
+        return replace(right, map=replace(right.map, labels=(0,) * len(right.map.labels)))
+
+    with (
+        patch.object(StepEngine, "_read", wrong),
+        pytest.raises(InternalError, match=rf"internal error: a map .* \(trace {trace.digest}\)"),
+    ):
+        solve(trace, Theory.causal())
+
+
+def test_what_is_asserted_is_told_to_the_engine_with_names() -> None:
+    """More is then apart: the clique that dstates are pinned to is larger, and clingo need not find that out."""
+    trace = Trace.from_steps("ab" * 20, ["travel"] * 39)
+    cliques = []
+    grow = NamedEngine.grow
+
+    def noted(self: NamedEngine, size: int) -> None:
+        grow(self, size)
+        cliques.append(len(self.clique))
+
+    theory = Theory.causal().replace(different=[(0, 2), (0, 4), (2, 4)])
+    with patch.object(NamedEngine, "grow", noted):
+        solution = solve(trace, theory, speedups=Speedups.without("prefixes"))
+    assert cliques[-1] == 5  # steps 0, 2 and 4, and so 1 and 3, from which the same action leads to two of these
+    assert solution.cost == solve(trace, theory, speedups=Speedups.without(SPEEDUPS)).cost
+    assert check(trace, solution.maps[0], theory) == ()

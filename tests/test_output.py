@@ -1,0 +1,324 @@
+"""What is written where: nothing but regular files is ever replaced, results come before pictures, lines stay lines, Ctrl-C is quiet."""
+
+from __future__ import annotations
+
+import builtins
+import json
+import os
+import stat
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from worlds import rectangle
+
+from perception import store
+from perception.recognition import recogniser
+from ssh_abduction import SSHMap, Trace, solve
+from ssh_abduction.cli import main
+from ssh_abduction.files import write_file
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+ACES = str(EXAMPLES / "aces3-route.jsonl")
+TRACE = rectangle(8)
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "trace": TRACE.save,
+    "map": solve(TRACE).maps[0].save,
+    "recogniser": lambda path: store.save(recogniser().fit(np.array([[1.0, 2.0], [2.0, 1.0]]), [0, 1]), path),
+}
+READERS: dict[str, Callable[[Path], object]] = {"trace": Trace.load, "map": SSHMap.load, "recogniser": store.load}
+
+each_writer = pytest.mark.parametrize("kind", WRITERS)
+
+
+@each_writer
+def test_a_pipe_takes_what_is_written(kind: str, tmp_path: Path) -> None:
+    pipe, copy = tmp_path / "pipe", tmp_path / "copy"
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: copy.write_bytes(pipe.read_bytes()))
+    reader.start()
+    WRITERS[kind](pipe)
+    reader.join(10)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    READERS[kind](copy)
+
+
+@each_writer
+def test_a_device_takes_what_is_written(kind: str, tmp_path: Path) -> None:
+    device = tmp_path / "null"
+    try:
+        os.mknod(device, stat.S_IFCHR | 0o600, os.makedev(1, 3))
+        device.write_bytes(b"")
+    except PermissionError:
+        pytest.skip("only root may make a device, and not everywhere use it")
+    WRITERS[kind](device)
+    assert stat.S_ISCHR(device.stat().st_mode)
+    assert [path.name for path in tmp_path.iterdir()] == ["null"]
+
+
+@each_writer
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_link_is_written_through(kind: str, exists: bool, tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    target, second, link = tmp_path / "there" / "target", tmp_path / "second", tmp_path / "link"
+    if exists:
+        target.write_text("old")
+    second.symlink_to(target)
+    link.symlink_to("second")
+    WRITERS[kind](link)
+    assert link.is_symlink()
+    assert second.is_symlink()
+    assert not target.is_symlink()
+    READERS[kind](target)
+
+
+@each_writer
+def test_a_file_is_replaced_whole_and_keeps_its_permissions(kind: str, tmp_path: Path) -> None:
+    path, other = tmp_path / "out", tmp_path / "other"
+    path.write_text("old")
+    path.chmod(0o640)
+    os.link(path, other)
+    WRITERS[kind](path)
+    READERS[kind](path)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert other.read_text() == "old"
+    assert len(list(tmp_path.iterdir())) == 2  # no draft is left behind
+
+
+def test_a_draft_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / ("n" * 255)  # as long as a name can be
+    write_file(path, b"old")
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_file(path, b"new")
+    assert [other.read_bytes() for other in tmp_path.iterdir()] == [b"old"]
+
+
+def test_a_closed_pipe_and_a_ring_of_links_are_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    for place in (tmp_path / "a", tmp_path, tmp_path / "none" / "x"):
+        assert main(["simulate", "notched-rectangle", "--route", "right", "-o", str(place)]) == 1
+        err = capsys.readouterr().err
+        assert err.startswith(f"ssh-abduction: {place}: cannot write the trace: ")
+        assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words", ["simulate notched-rectangle", "cluster x", "train x y", "reproduce notched-rectangle --seeds 0", "evaluate x y --plot"]
+)
+def test_no_name_is_no_file(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main([*words.split(), *([] if words.endswith("--plot") else ["-o"]), ""])
+    assert "expected the name of a file or folder, got ''" in capsys.readouterr().err or words.endswith("--plot")
+
+
+def test_every_verb_that_writes_writes_into_a_pipe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "run.jsonl"
+    assert main(["simulate", "notched-rectangle", "--tours", "2", "--no-stars", "-o", str(run)]) == 0
+    views = tmp_path / "views.jsonl"
+    assert main(["cluster", str(run), "--k", "4", "-o", str(views)]) == 0
+    capsys.readouterr()
+    assert main(["solve", str(views), "--theory", "causal", "--json"]) == 0
+    maps = tmp_path / "maps.json"
+    maps.write_text(capsys.readouterr().out)
+    for words in (
+        ["simulate", "notched-rectangle", "--route", "right", "-o"],
+        ["cluster", str(run), "--k", "4", "-o"],
+        ["train", str(views), str(maps), "-o"],
+        ["evaluate", str(views), str(maps), "--map", "1", "--folds", "2", "--plot"],
+    ):
+        pipe, got = tmp_path / "pipe.png", []
+        os.mkfifo(pipe)
+        reader = threading.Thread(target=lambda pipe=pipe, got=got: got.append(pipe.read_bytes()))
+        reader.start()
+        assert main([*words, str(pipe)]) == 0
+        reader.join(10)
+        assert stat.S_ISFIFO(pipe.stat().st_mode)
+        assert len(got[0]) > 100
+        pipe.unlink()
+    capsys.readouterr()
+
+
+@pytest.fixture
+def learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """The words of `evaluate` for a small trace with images and its map."""
+    lines = [{"format": "ssh-trace", "version": 1}]
+    lines += [{"view": "ab"[i % 2], "image": [1.0 + i % 2, 2.0 + i / 100], "action": "travel"} for i in range(8)]
+    del lines[-1]["action"]
+    (tmp_path / "t.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert main(["solve", str(tmp_path / "t.jsonl"), "--theory", "causal", "--json"]) == 0
+    (tmp_path / "m.json").write_text(capsys.readouterr().out)
+    return ["evaluate", str(tmp_path / "t.jsonl"), str(tmp_path / "m.json"), "--folds", "2"]
+
+
+def test_matplotlib_is_looked_for_before_anything_is_done(
+    tmp_path: Path, learnt: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load = builtins.__import__
+
+    def without(name: str, *rest: Any) -> Any:
+        if name.startswith("matplotlib"):
+            raise ImportError(name)
+        return load(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    for name in [name for name in sys.modules if name.startswith("matplotlib")]:
+        monkeypatch.setitem(sys.modules, name, None)
+    never = tmp_path / "never"
+    for words in (
+        [*learnt, "--plot", str(never / "x.png")],
+        ["cluster", learnt[1], "-o", str(never), "--plot", str(never / "x.png")],
+        ["reproduce", "notched-rectangle", "-o", str(never)],
+    ):
+        assert main(words) == 1
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err == "ssh-abduction: plot: expected matplotlib to draw with, got none; pip install 'ssh-abduction[plot]'\n"
+        assert not never.exists()
+    assert main(learnt) == 0
+
+
+def test_a_picture_that_fails_loses_nothing(tmp_path: Path, learnt: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*learnt, "--json", "--plot", str(tmp_path / "none" / "x.png")]) == 1
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["folds"] == 2
+    assert captured.err.count("\n") == 1
+    clustered = tmp_path / "views.jsonl"
+    assert main(["cluster", learnt[1], "--k", "2", "-o", str(clustered), "--plot", str(tmp_path / "none" / "x.png")]) == 1
+    assert Trace.load(clustered)
+    assert "chosen" in capsys.readouterr().out
+
+
+def test_a_reproduction_writes_its_data_before_it_draws(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ssh_abduction.reproduce import report
+
+    def fails(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(report, "measure", lambda name, seed: type("Run", (), {"seed": seed}))
+    monkeypatch.setattr(report, "to_dict", lambda run: {"seed": run.seed})
+    monkeypatch.setattr(report, "summary", lambda *_: [{"claim": "c", "paper": "p", "here": {"0": "x"}, "holds": 1, "seeds": 1}])
+    monkeypatch.setattr(report, "_draw", fails)
+    assert main(["reproduce", "taylor-hall", "--seeds", "0", "--jobs", "1", "-o", str(tmp_path)]) == 1
+    captured = capsys.readouterr()
+    assert "1 of 1" in captured.out
+    assert captured.err == "ssh-abduction: output: cannot be written: No space left on device; make room\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"claims.json", "runs.json", "configuration.json", "report.html"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="terminals")
+def test_json_goes_to_its_file_while_progress_shows_on_a_terminal(tmp_path: Path) -> None:
+    import pty
+
+    ours, theirs = pty.openpty()
+    with (tmp_path / "maps.json").open("wb") as file:
+        command = [sys.executable, "-m", "ssh_abduction", "solve", ACES, "--json"]
+        done = subprocess.run(command, stdout=file, stderr=theirs, env={**os.environ, "TERM": "xterm"}, check=False)
+    os.close(theirs)
+    os.close(ours)
+    assert done.returncode == 0
+    assert len(json.loads((tmp_path / "maps.json").read_text())["maps"]) == 4
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="terminals")
+@pytest.mark.parametrize("words", [["solve", ACES], ["solve", ACES, ACES]])
+def test_json_is_not_wrapped_on_a_narrow_terminal(words: list[str]) -> None:
+    """Nor does it go elsewhere: rich takes over stdout while it shows how far a search is."""
+    import pty
+    import termios
+
+    ours, theirs = pty.openpty()
+    attributes = termios.tcgetattr(theirs)
+    attributes[1] &= ~termios.OPOST  # what is printed comes as it is
+    termios.tcsetattr(theirs, termios.TCSANOW, attributes)
+    wrong, their_wrong = pty.openpty()
+    command = [sys.executable, "-m", "ssh_abduction", *words, "--json"]
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "30"}
+    printed = {ours: b"", wrong: b""}
+
+    def read(end: int) -> None:
+        try:
+            while chunk := os.read(end, 65536):
+                printed[end] += chunk
+        except OSError:  # the terminal is gone when the program is
+            pass
+
+    with subprocess.Popen(command, stdout=theirs, stderr=their_wrong, env=environment) as process:
+        os.close(theirs)
+        os.close(their_wrong)
+        readers = [threading.Thread(target=read, args=(end,)) for end in printed]
+        for reader in readers:
+            reader.start()
+        assert process.wait(60) == 0
+        for reader in readers:
+            reader.join(10)
+    lines = printed[ours].decode().splitlines()
+    if words.count(ACES) > 1:
+        assert [json.loads(line)["count"] for line in lines] == [4, 4]
+    else:
+        assert len(json.loads("".join(lines))["maps"]) == 4
+        assert len(lines) == 6
+
+
+CTRL_C_AT = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.parametrize(
+    "module", ["ssh_abduction.cli", "argparse", "clingo", "ssh_abduction.cli.train", "numpy", "numpy.linalg", "sklearn.base"]
+)
+@pytest.mark.parametrize("program", ["-m ssh_abduction", "-c import~sys;from~ssh_abduction.__main__~import~run;sys.exit(run())"])
+def test_ctrl_c_while_modules_load_is_quiet(program: str, module: str, tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(CTRL_C_AT.format(module=module))
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    words = [word.replace("~", " ") for word in program.split(" ")]
+    command = [sys.executable, *words, "simulate", "notched-rectangle", "--route", "right", "-o", str(tmp_path / "out")]
+    if module.startswith("sklearn"):
+        command[-6:] = ["recognise", str(tmp_path / "none"), ACES]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_what_would_steer_a_terminal_is_escaped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    strange = "\x1b[31m\x9bred\u202e"
+    trace, maps = tmp_path / f"{strange}.jsonl", tmp_path / "maps.json"
+    go = {"name": f"go{strange}", "kind": "travel"}
+    Trace.from_steps([f"a{strange}", "b", "a", "c"], [go] * 3).save(trace)
+    assert "\x9b" not in trace.read_text()
+    assert main(["solve", str(trace), "--json"]) == 0
+    maps.write_text(capsys.readouterr().out)
+    missing = tmp_path / f"none{strange}"
+    for words in (
+        *(["solve", str(trace)], ["solve", str(trace), str(trace)], ["check", str(trace), str(maps)], ["check", ACES, str(maps)]),
+        *(["show", str(maps)], ["show", str(maps), "--dot"], ["show", str(maps), "--svg"], ["show", str(maps), "--graphml"]),
+        *(["solve", str(missing)], ["show", str(missing)], ["recognise", str(missing), ACES], ["simulate", f"{missing}.json", "-o", "x"]),
+        *(["cluster", str(trace), "-o", str(missing)], ["simulate", "notched-rectangle", "--route", "right", "-o", str(missing)]),
+    ):
+        main(words)
+        captured = capsys.readouterr()
+        for text in (captured.out, captured.err):
+            assert not set(strange[0] + strange[5] + strange[-1]) & set(text.replace("\u202e", "") if words[0] == "show" else text), words
+    for words in (["solve", ACES, f"--{strange}"], [strange]):
+        with pytest.raises(SystemExit):
+            main(words)
+        assert "\x1b" not in capsys.readouterr().err
