@@ -56,6 +56,15 @@ class PlaceRecognizer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """Share of the neighbours that have each of `classes_`, (n, c)."""
         return np.asarray(self._neighbours().predict_proba(self._images(X)), np.float64)
 
+    def learnt_again(self) -> PlaceRecognizer:
+        """A recogniser that learns from scratch the images and labels that this one remembers, and so answers the same.
+
+        scikit-learn's compiled search trusts its tables, and tables that were damaged in a file can end the whole process. What is learnt
+        again has been checked again. Raises PerceptionError, ValueError or another error of numpy's where the tables are not sound.
+        """
+        held = self._neighbours()
+        return PlaceRecognizer(self.n_neighbors).fit(held._fit_X, np.asarray(self.classes_)[np.asarray(held._y)])
+
     def _neighbours(self) -> Any:
         check_is_fitted(self)
         return self.neighbours_

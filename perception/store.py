@@ -18,6 +18,7 @@ import numpy as np
 import skops.io
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator
+from sklearn.pipeline import Pipeline
 
 from perception.errors import PerceptionError
 from perception.reciprocal import ReciprocalTransformer
@@ -115,7 +116,19 @@ def load(path: str | os.PathLike[str]) -> Stored:
     for part, kind in (("model", BaseEstimator), ("classes", list), ("versions", dict)):
         if not isinstance(held.get(part), kind):
             raise PerceptionError(f"{path}: {part}: expected a {kind.__name__}, got {_kind(held.get(part))}; save the recogniser again")
-    return Stored(held["model"], tuple(held["classes"]), held["versions"])
+    try:
+        return Stored(_learnt_again(held["model"]), tuple(held["classes"]), held["versions"])
+    except Exception as error:  # what is damaged fails in as many ways as there are parts
+        raise PerceptionError(f"{path}: model: expected a fitted one, got {type(error).__name__}: {error}; train it again") from None
+
+
+def _learnt_again(model: Any) -> Any:
+    """The model, in which each recogniser of places has learnt its images again, so that no damaged table reaches compiled code."""
+    if isinstance(model, PlaceRecognizer):
+        return model.learnt_again()
+    if isinstance(model, Pipeline):
+        return Pipeline([(name, _learnt_again(step)) for name, step in model.steps])
+    return model
 
 
 def _kind(value: object) -> str:
