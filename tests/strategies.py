@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -19,6 +19,8 @@ ACTIONS = (*STANDARD_ACTIONS.values(), Action("creep", "travel"), Action("veer",
 STARS = ((1, 1, 1, 1), (1, 0, 1, 0), (1, 1, 0, 0), (1, 0, 0, 0), (1, 1, 1, 0))
 
 
+FOREIGN = ("without", "rules")  # what the checker cannot judge maps by
+PAIRS = ("same", "different", "elsewhere")
 # Axioms that may be left out: the map can't show what holds without these, as a dstate of a map has one place and one course.
 LEFT_OUT = sorted({axiom.name for axiom in axioms()} - {"one_place", "one_course", "one_heading", "turn_rotates", "star_frame", "asserted"})
 
@@ -115,16 +117,15 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
 
 
 @st.composite
-def theories(draw: st.DrawFn, trace: Trace, plain: bool = False) -> Theory:
+def theories(draw: st.DrawFn, trace: Trace, fixed: Collection[str] = ()) -> Theory:
     """Any choice of axioms and preference that a theory of this trace may have. Without a preference every consistent map is minimal.
 
-    plain  without rules, and with all axioms
+    fixed  fields that are left as they are in a new Theory
     """
-    kept = ("without", "rules") if plain else ()
-    choices: dict[str, Any] = {f.name: draw(choices_of(f.name, trace), label=f.name) for f in fields(Theory) if f.name not in kept}
+    choices: dict[str, Any] = {f.name: draw(choices_of(f.name, trace), label=f.name) for f in fields(Theory) if f.name not in fixed}
     if draw(st.integers(0, 9)) == 9:
         causal = {"level": "causal", "boundary": "none", "star": "none", "prefer": draw(st.sampled_from([("dstates",), ()]))}
         rules = [rules for rules in choices.get("rules", ()) if next(toy for toy in TOYS if toy.rules == rules).causal]
-        return Theory(**{**choices, **causal, **({} if plain else {"rules": rules})})
+        return Theory(**{**choices, **causal, "rules": rules})
     prefer: tuple[Count, ...] = tuple(name for name in choices["prefer"] if name != "excuses" or choices["boundary"] == "defeasible")
     return Theory(**{**choices, "prefer": prefer})

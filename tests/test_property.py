@@ -8,7 +8,7 @@ import pytest
 from brute_force import consistent_maps, key, minimal_maps
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import TOYS, theories, traces
+from strategies import FOREIGN, TOYS, theories, traces
 
 from ssh_abduction import solve
 from ssh_abduction.judge.checker import check
@@ -71,8 +71,8 @@ def test_excuses_alone_are_minimised_where_no_pair_of_paths_can_be_excused(prefe
 def test_checker_rejects_what_the_brute_force_does_not_find(data: st.DataObject) -> None:
     """The maps of one theory under the axioms of another. Where these allow the map, its witnesses may still have to change."""
     trace = data.draw(traces(), label="trace")
-    theory = data.draw(theories(trace, plain=True), label="theory of the maps")
-    other = data.draw(theories(trace, plain=True), label="theory to check them by")
+    theory = data.draw(theories(trace, fixed=FOREIGN), label="theory of the maps")
+    other = data.draw(theories(trace, fixed=FOREIGN), label="theory to check them by")
     consistent = {found for found, _ in consistent_maps(trace, other)}
     for ssh_map in solve(trace, theory, maps=50, limit=LIMIT).maps:
         if key(ssh_map) not in consistent:

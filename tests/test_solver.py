@@ -382,7 +382,7 @@ def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
     class Impatient(solver_module.Watch):
         left = 100
 
-        def check(self) -> None:
+        def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
             self.left -= 1
             if not self.left:
                 raise solver_module.Stopped("time limit")

@@ -16,7 +16,7 @@ one node, linked by rotations both ways. Nodes are apart if that follows from wh
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -53,13 +53,13 @@ class Chart:
     seen: tuple[int, ...]
     links: tuple[Link, ...]
     node_of: Sequence[int]
-    excluded: Collection[tuple[int, int]] = field(default=(), kw_only=True)
+    excluded: frozenset[tuple[int, int]] = field(default=frozenset(), kw_only=True)
 
     @staticmethod
     def of_steps(log: Log, size: int) -> Chart:
         """The chart of the first steps, each a node."""
         links = tuple((t, log.actions[t], t + 1) for t in range(size - 1))
-        return Chart(tuple(log.seen[:size]), links, range(size), excluded=_among(log.pairs.apart, size))
+        return Chart(tuple(log.seen[:size]), links, range(size), excluded=frozenset(_among(log.pairs.apart, size)))
 
     def apart(self) -> NDArray[np.bool_]:
         """Which pairs of nodes are apart: nodes x nodes."""
@@ -220,8 +220,19 @@ class FramedChart(Chart):
         nodes = next((node for node, (visit, _) in enumerate(self.facing) if visit == visits), len(self.facing))
         steps = next((step for step, node in enumerate(self.node_of) if node >= nodes), len(self.node_of))
         links = tuple(link for link in self.links if max(link[0], link[2]) < nodes)
+        elsewhere, away, excluded = (
+            frozenset(pair for pair in pairs if max(pair) < nodes) for pairs in (self.elsewhere, self.away, self.excluded)
+        )
         return FramedChart(
-            self.seen[:nodes], links, self.node_of[:steps], self.facing[:nodes], self.stars[:visits], self.travels[: visits - 1]
+            self.seen[:nodes],
+            links,
+            self.node_of[:steps],
+            self.facing[:nodes],
+            self.stars[:visits],
+            self.travels[: visits - 1],
+            elsewhere,
+            away,
+            excluded=excluded,
         )
 
     def visits_with(self, pairs: int) -> int:

@@ -9,7 +9,7 @@ steps before it was small. Where a robot explores, the clique grows with each ne
 >>> circuits = [0, 1, 2, 3] * 8
 >>> noise_in(circuits, [0] * 31)
 >>> noise_in([*circuits, 2], [0] * 32)
-Noise(step=32, told_apart=33, without=4)
+Noise(step=32, told_apart=32, without=4)
 """
 
 from __future__ import annotations
