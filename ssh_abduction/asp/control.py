@@ -84,6 +84,12 @@ class Control(clingo.Control):
         with _grounding:
             super().load(path)
 
+    def load_encodings(self, *names: str) -> None:
+        """Load these encodings, with the files that they share with others."""
+        for name in names:
+            for path in encodings.paths(name):
+                self.load(path)
+
     def add(self, *program: Any) -> None:
         with _grounding:
             super().add(*program)
@@ -266,7 +272,7 @@ def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
 def new_control(encoding: str, base: str, options: Sequence[str], speedups: Speedups) -> Control:
     """A control with an encoding, and these facts in its base."""
     control = Control(options)
-    control.load(encodings.path(encoding))
+    control.load_encodings(encoding)
     control.add("base", [], base if speedups.watched else f"{base}\n{facts.watched()}.")
     control.ground([("base", [])])
     return control

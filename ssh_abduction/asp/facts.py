@@ -334,7 +334,7 @@ def listed(batch: int) -> Symbol:
 
 def alone(place: int) -> Symbol:
     """The atom that the node at this place of the order is the first at its dstate."""
-    return Function("alone", numbers(place))
+    return Function("first", numbers(place))
 
 
 def over(core: int, count: int) -> Symbol:
@@ -391,13 +391,13 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
 
 
 def street_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
-    """What happened at the nodes of a chart, as facts for streets.lp."""
-    facts = [f"turned({s},{x},{-action})." for s, action, x in chart.links if action < 0]
-    facts += [f"travel({s},{x})." for s, _, x in chart.travels]
-    facts += [f"around({s},{x})." if turn == "around" else f"bend({s},{turn},{x})." for s, turn, x in chart.turns(trace)]
-    facts += [f"unlike({s},{x})." for s, x in chart.excluded]
+    """What happened at the nodes of a chart, as facts for paths_framed.lp."""
+    facts = [f"rotated({s},{x},{-action})." for s, action, x in chart.links if action < 0]
+    facts += [f"travelled({s},{x})." for s, _, x in chart.travels]
+    facts += [f"turned({s},{turn},{x})." for s, turn, x in chart.turns(trace)]
+    facts += [f"excluded({s},{x})." for s, x in chart.excluded]
     visits = {(chart.facing[s][0], chart.facing[x][0]): (s, x) for s, x in chart.away}
-    facts += [f"away({s},{x})." for s, x in visits.values()]
+    facts += [f"far_nodes({s},{x})." for s, x in visits.values()]
     return "\n".join([*facts, side_facts(theory)])
 
 
@@ -409,7 +409,7 @@ def side_facts(theory: Theory) -> str:
 
 
 def way_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
-    """Which numbered actions are travels and turns, and which axioms of sides hold, as facts for ways.lp."""
+    """Which numbered actions are travels and turns, and which axioms of sides hold, as facts for sides_frameless.lp."""
     kinds = [f"turns({a},{action.turn})." if action.turn else f"travels({a})." for a, action in actions.items()]
     return "\n".join([*kinds, side_facts(theory)])
 
@@ -423,7 +423,7 @@ def course_facts(
     *,
     single: bool = False,
 ) -> str:
-    """Dstates, the numbered actions that link them, and what is preferred, as facts for courses.lp; or for single courses."""
+    """Dstates, the numbered actions that link them, and what is preferred, as facts for paths_frameless.lp; or for single segments."""
     facts = [side_facts(theory), *(["total."] if theory.path_order == "total" else []), *(["single."] if single else [])]
     facts += [f"is({x})." for x in dstates]
     facts += [f"far({x},{y})." for x, y in far]
@@ -432,7 +432,7 @@ def course_facts(
 
 
 def turn_facts(batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]) -> str:
-    """New visits, and new turns on a visit, from slot to slot, as facts for sides.lp."""
+    """New visits, and new turns on a visit, from slot to slot, as facts for sides_framed.lp."""
     facts = [f"visit({batch},{visit})." for visit in visits]
     for s, turn, x in turns:
         (visit, slot), (_, faced) = chart.facing[s], chart.facing[x]
@@ -458,14 +458,14 @@ def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nod
 
 
 def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
-    """The stretches of streets.lp, and pairs of them that cannot be one path, in neither direction."""
-    stretches = sorted(_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("stretch", 1))
-    rivals = {tuple(_atom(atom.symbol)[1]) for atom in control.symbolic_atoms.by_signature("rival", 3)}
+    """The stretches of paths_framed.lp, and pairs of them that cannot be one path, in neither direction."""
+    stretches = sorted(_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("segment", 1))
+    rivals = {tuple(_atom(atom.symbol)[1]) for atom in control.symbolic_atoms.by_signature("distinct", 3)}
     return stretches, [(g, h) for g, h, direction in rivals if direction == 1 and (g, h, -1) in rivals]
 
 
 def pinned_facts(stretches: Iterable[int]) -> str:
-    """Stretches no two of which can be one path, as facts for streets.lp."""
+    """Stretches no two of which can be one path, as facts for paths_framed.lp."""
     return " ".join(f"pinned({stretch})." for stretch in stretches)
 
 
@@ -511,7 +511,7 @@ def forbidden_links(links: Iterable[tuple[int, int, int]], placed: Iterable[tupl
 
 @dataclass(frozen=True, slots=True)
 class StreetAnswer:
-    """An answer of streets.lp or courses.lp.
+    """An answer of paths_framed.lp or paths_frameless.lp.
 
     at     of each place that the turns tell, the place that it is at, and how it is turned to it
     part   of each stretch, the path that it is part of, and in which direction
@@ -524,7 +524,7 @@ class StreetAnswer:
 
 
 class StreetReader:
-    """Reads the maps of one labelling of nodes from answers of streets.lp or courses.lp; what the labels alone tell is worked out once.
+    """Reads the maps of one labelling of nodes from answers of paths_framed.lp or paths_frameless.lp; what the labels alone tell is worked out once.
 
     An answer is asked for atoms that it may hold, those of the last one first: that takes a third of the time that it takes to read all it holds.
     """

@@ -13,6 +13,7 @@ FIRST = ("causal", "topological", "boundary", "star")  # each needs those before
 _AXIOM = re.compile(r"^% @axiom\((?P<name>\w+)\) (?:(?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if (?P<when>.+))?|(?P<alone>.+))$")
 _WHEN = re.compile(r"^% @when (?P<when>.+)$")
 _KEEPS = re.compile(r"^% @keeps (?P<names>.+)$")
+_WITH = re.compile(r"^% @with (?P<names>.+)$")
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,22 @@ def needed_by(choices: Mapping[str, object]) -> tuple[str, ...]:
 
 
 @cache
+def paths(name: str) -> tuple[str, ...]:
+    """The paths of all files that make the encoding `name`: its own, and before it those that it shares with another one, as `% @with` says at its head.
+
+    Clingo's `#include` is not used for that, as it prefers a file of the working directory which happens to have the same name.
+    """
+    own = path(name)
+    return (*(path(shared) for shared in _said(own, _WITH)), own)
+
+
+@cache
 def keeps(*names: str) -> frozenset[str]:
-    """The axioms that these fast encodings say at their heads that they keep, together."""
-    lines = [line for name in names for line in Path(path(name)).read_text(encoding="utf-8").splitlines()]
-    return frozenset(axiom for line in lines if (match := _KEEPS.match(line)) for axiom in match["names"].split())
+    """The axioms that these fast encodings say at their heads that they keep, together and with the files that they share."""
+    return frozenset(axiom for name in names for file in paths(name) for axiom in _said(file, _KEEPS))
+
+
+def _said(file: str, head: re.Pattern[str]) -> list[str]:
+    """The names in all lines of a file that have such a head."""
+    lines = Path(file).read_text(encoding="utf-8").splitlines()
+    return [name for line in lines if (match := head.match(line)) for name in match["names"].split()]

@@ -201,7 +201,7 @@ TABLE = (
         "Places with frames: settle dstates, as visits that are one, before places and paths.",
         _has_frames,
         FRAMES,
-        _kept_by("same", "sides", "streets", and_also=["asserted"]),
+        _kept_by("visits", "sides_framed", "paths_framed", and_also=["asserted"]),
     ),
     Speedup(
         "ways",
@@ -209,7 +209,7 @@ TABLE = (
         "Places without stars: where clingo takes its time, settle dstates before places and paths, with names.",
         _has_bare_places,
         PLACES,
-        _kept_by("names", "ways", "courses", and_also=["asserted"]),
+        _kept_by("names", "sides_frameless", "paths_frameless", and_also=["asserted"]),
     ),
     Speedup(
         "clique",
