@@ -77,11 +77,8 @@ class BootstrapLearner:
 def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool = True) -> NDArray[np.intp]:
     """The label of each step, (n,): its dstate in the chosen map; or, if none is chosen, in the first map, and -1 where the maps disagree.
 
-    Maps agree on a step if the first step at its dstate is the same in all of them.
-
-    complete  whether these are all minimal maps
-
-    Warns if no map is chosen and the maps do not agree everywhere, or are not complete. Raises LearnerError where no map or no label is left.
+    Maps agree on a step if the first step at its dstate is the same in all of them. Warns if no map is chosen and they do not agree
+    everywhere, or if there may be more (`complete` is false). Raises LearnerError where no map or no label is left.
     """
     if not maps:
         raise LearnerError("maps: expected at least one to take labels from, got none; see the solution's status")

@@ -19,9 +19,9 @@ from ssh_abduction.maps import SSHMap, xml_text
 Point: TypeAlias = tuple[float, float]
 
 # In units of the page: between neighbouring places, around the picture, the radius of a place, from the middle of a place to the name of a dstate, and how far a
-# dstate is drawn beside the line of its path. Chosen by eye, so that names do not overlap at a place of four dstates.
+# dstate is drawn beside the line of its path.
 SPACING, MARGIN, RADIUS, DSTATE, LANE = 130.0, 80.0, 17.0, 38.0, 9.0
-# Of the paths, in turn; people who see colours differently can tell them apart (after Okabe & Ito).
+# The colours of the paths, in turn. The first six are of the palette of Okabe & Ito, which people who are colour-blind can tell apart.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b")
 # Characters of a view that are shown below a dstate: longer ones would run into the neighbours. The end is kept, as long names often begin alike.
 LONGEST_LABEL = 20
