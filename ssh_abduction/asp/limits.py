@@ -16,13 +16,15 @@ TICK = 0.5  # seconds between reports of progress while clingo is busy
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
 
 
-class Stopped(Exception):  # noqa: N818 - not an error
+class LimitError(Exception):
+    """A limit of a search is over, or somebody interrupted it. What is known by then is the answer."""
+
     def __init__(self, reason: Stop) -> None:
         self.reason = reason
 
 
-class Paused(Exception):  # noqa: N818 - not an error
-    """Something else is to be done first."""
+class StageTimeError(Exception):
+    """The time is over that one stage of a search has: the next stage begins."""
 
 
 class Watch:
@@ -50,7 +52,7 @@ class Watch:
         self._memory = memory
         self._started: float | None = None
         self._spent = 0.0
-        self._pause_at = math.inf
+        self._stage_ends = math.inf
         self.interrupted = False
 
     def start(self) -> None:
@@ -82,9 +84,9 @@ class Watch:
         """From now on the time limit is this, if that is less."""
         self._limit = self._allowed = seconds if self._limit is None else min(seconds, self._limit)
 
-    def pause_after(self, seconds: float) -> None:
-        """Let `check` raise Paused, once, when so much time was spent."""
-        self._pause_at = seconds
+    def end_stage_after(self, seconds: float) -> None:
+        """Let `check` raise StageTimeError, once, when so much time was spent."""
+        self._stage_ends = seconds
 
     def elapsed(self) -> float:
         return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
@@ -92,17 +94,17 @@ class Watch:
     def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
         """Raise if a limit is over, or would be after what cannot be interrupted and takes so many seconds, and so much memory."""
         if self.interrupted:
-            raise Stopped("interrupted")
+            raise LimitError("interrupted")
         if self.elapsed() > self._next_tick:
             self._next_tick = self.elapsed() + TICK
             self._on_tick()
         if not self.allows(ahead):
-            raise Stopped("time limit")
+            raise LimitError("time limit")
         if self._memory is not None and peak_memory() + mebibytes > self._memory:
-            raise Stopped("memory limit")
-        if self.elapsed() > self._pause_at:
-            self._pause_at = math.inf
-            raise Paused
+            raise LimitError("memory limit")
+        if self.elapsed() > self._stage_ends:
+            self._stage_ends = math.inf
+            raise StageTimeError
 
     def allows(self, seconds: float) -> bool:
         """Whether there is time for so many seconds of what cannot be interrupted."""

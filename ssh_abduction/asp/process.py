@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TypeVar
 
-from ssh_abduction.asp.limits import POLL, Stopped, Watch
+from ssh_abduction.asp.limits import POLL, LimitError, Watch
 
 Result = TypeVar("Result")
 
@@ -31,7 +31,7 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
     work, arguments  picklable; so are the result, and what work raises
     watch            may end the process. What it leaves of the memory limit is that of the other one
 
-    Raises Stopped, also where something from outside ends the process.
+    Raises LimitError, also where something from outside ends the process.
     """
     code, answer = _run(work, arguments, watch)
     if code == 0:
@@ -41,7 +41,7 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
             raise error
         return result
     if code < 0:
-        raise Stopped("memory limit")  # else nobody ends it
+        raise LimitError("memory limit")  # else nobody ends it
     return work(*arguments, watch)
 
 

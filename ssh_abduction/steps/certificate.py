@@ -57,7 +57,7 @@ class Certificate:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Basis:
     """What a certificate is worked out from once it is asked for: a short trace is solved in the time that this takes.
 
     views    what was seen at the first steps of the trace, and
