@@ -17,13 +17,16 @@ from strategies import STARS
 
 from ssh_abduction import OnlineMapper, Search, Speedups, Status, Theory, Trace, solve
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import Stopped, Watch
+from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.engines import base as engine
-from ssh_abduction.engines import framed, streets
+from ssh_abduction.engines import framed
+from ssh_abduction.engines import paths as streets
 from ssh_abduction.engines import visits as same
 from ssh_abduction.engines.base import Cost, Found
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.engines.nearby import Beside, NearbySearch
+from ssh_abduction.engines.sides import FramedSides
+from ssh_abduction.engines.visits import OPEN, VisitLabels
 from ssh_abduction.guesses import annealing
 from ssh_abduction.guesses.annealing import Guess, attempts
 from ssh_abduction.guesses.merging import kept, merged_near
@@ -31,7 +34,8 @@ from ssh_abduction.judge.checker import check
 from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import search as solver
-from ssh_abduction.steps.chart import QUARTERS, Chart, FramedChart, NoFrame, numbered
+from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.steps.chart import QUARTERS, Chart, FramedChart, numbered
 from ssh_abduction.steps.log import Log
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import SPEEDUPS
@@ -88,9 +92,9 @@ def always_named_at(engine: FramedEngine, dstates: int) -> NearbySearch | None:
     return engine._named if engine._named and engine._named.bound == dstates else None
 
 
-def plainly_charted(engine: FramedEngine, size: int) -> FramedChart:
+def plainly_charted(engine: FramedEngine, size: int, before: FramedChart | None = None) -> FramedChart | None:
     """Without what the trace alone says of order and sides, so that it has to be found."""
-    return Chart.framed(engine._trace, engine._log, size)
+    return Chart.framed(engine._task.trace, engine._task.log, size)
 
 
 @settings(max_examples=70, deadline=None, derandomize=True)
@@ -128,12 +132,12 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         patch.object(streets, "SECONDS", 0.0),
         patch.multiple(annealing, ANNEALED=((0.5, data.draw(st.integers(1, 20), label="sweeps")),), LAST=2),
         patch.object(FramedEngine, "_charted", charted),
-        patch.object(FramedEngine, "_has_processors", lambda _: processors),
+        patch.object(engine.Task, "has_processors", processors),
     ):
         search = Search(trace, theory, maps=0, speedups=Speedups.without(off))
         maps = tuple(search)
     found = search.solution(maps)
-    assert isinstance(search._engine, FramedEngine)
+    assert isinstance(search._prefixes.engine, FramedEngine)
     assert found.status is expected.status
     assert set(maps) == set(expected.maps)
     assert len(set(maps)) == len(maps)
@@ -156,7 +160,7 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: The
         patch.object(same, "FIRST_PAIRS", 5 * (sweeps % 3)),
         patch.object(streets, "SECONDS", 0.0),
         patch.multiple(annealing, ANNEALED=((0.5, sweeps),), LAST=2),
-        patch.object(FramedEngine, "_has_processors", lambda _: True),
+        patch.object(engine.Task, "has_processors", True),
         patch.object(FramedEngine, "_named_at", always_named_at),
         patch.object(FramedEngine, "_charted", plainly_charted),
     ):
@@ -178,7 +182,7 @@ def test_a_limit_ends_the_search_beside(limit: float) -> None:
     """While it guesses, or while it asks clingo. What is left is a map, and a bound."""
     trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(400)
     before = set(threading.enumerate())
-    with patch.object(framed, "SOON", 0.0), patch.object(FramedEngine, "_has_processors", lambda _: True):
+    with patch.object(framed, "SOON", 0.0), patch.object(engine.Task, "has_processors", True):
         search = Search(trace, Theory.topological(), limit=limit)
         maps = tuple(search)
     solution = search.solution(maps)
@@ -197,7 +201,7 @@ def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, 
     expected = solve(walk.trace, Theory.topological(), maps=0, speedups=Speedups.without("annealed"))
     with (
         patch.multiple(framed, SOON=-1.0, Beside=Before),
-        patch.object(FramedEngine, "_has_processors", lambda _: True),
+        patch.object(engine.Task, "has_processors", True),
         patch.object(FramedEngine, "_named_at", always_named_at),
     ):
         found = solve(walk.trace, Theory.topological(), maps=0)
@@ -247,9 +251,9 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
                 expected = solve(trace.prefix(i + 2), maps=0, speedups=Speedups.without("sides"))
                 assert (answer.cost, answer.bound.dstates, answer.complete) == (expected.cost, expected.bound.dstates, True)
                 assert set(answer.maps) == set(expected.maps)
-            engine = mapper._search and mapper._search._engine
+            engine = mapper._search and mapper._search._prefixes.engine
             if isinstance(engine, FramedEngine):
-                streets.add((engine._batch, len(engine._said)))
+                streets.add((engine._visits.batch, len(engine._sides._said)))
     assert max(streets)[0] > 5
     assert seed != 0 or any(told for _, told in streets)
 
@@ -272,9 +276,10 @@ def test_apart_nodes_are_different_dstates_of_the_world() -> None:
     for seed in range(6):
         walk = maze(3, 3, steps=120, seed=seed, stars=True)
         search = Search(walk.trace, Theory.topological())
-        engine = search._engine
+        engine = search._prefixes.engine
         assert isinstance(engine, FramedEngine)
-        chart = engine._charted(len(walk.trace))
+        chart = engine._charted(len(walk.trace), None)
+        assert chart
         truth = dict(zip(chart.node_of, walk.truth, strict=True))
         assert len(truth) == len(chart.seen)
         apart = chart.apart()
@@ -322,8 +327,7 @@ def test_nodes_that_one_frame_fits_are_not_apart() -> None:
 def test_a_visit_that_fits_no_frame_has_no_map() -> None:
     stars = [(1, 0, 0, 0), (0, 0, 0, 1), (0, 0, 1, 0), (0, 1, 0, 0), (1, 1, 0, 0)]
     trace = Trace.from_steps("aaaaa" * 6, ["right"] * 29, stars=stars * 6)
-    with pytest.raises(NoFrame):
-        Chart.framed(trace, Log(trace, Theory(star="frame")))
+    assert Chart.framed(trace, Log(trace, Theory(star="frame"))) is None
     solution = solve(trace, Theory.topological())
     assert solution.status is Status.UNSATISFIABLE
     assert solution.complete
@@ -371,8 +375,8 @@ def test_what_is_not_told_beforehand_is_found() -> None:
     """Every answer is refused until clingo was told what order and sides forbid; the maps are the same."""
     walk = maze(2, 2, steps=60, seed=1, stars=True)
     expected = solve(walk.trace, Theory.topological(), maps=0)
-    for off, asked in (("", "_say_street"), ("sides", "_clashing")):
-        finding = patch.object(FramedEngine, asked, autospec=True, side_effect=getattr(FramedEngine, asked))
+    for off, kind, asked in (("", FramedSides, "say_of_path"), ("sides", FramedEngine, "_clashing")):
+        finding = patch.object(kind, asked, autospec=True, side_effect=getattr(kind, asked))
         with patch.object(FramedEngine, "_charted", plainly_charted), finding as found:
             maps = solve(walk.trace, Theory.topological(), maps=0, speedups=Speedups.without(off)).maps
         assert found.called
@@ -387,17 +391,17 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
     contradicted = 0
     for seed in range(12):
         trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
-        engine = Search(trace, theory)._engine
+        engine = Search(trace, theory)._prefixes.engine
         assert isinstance(engine, FramedEngine)
         with patch.object(FramedEngine, "_charted", plainly_charted):
             engine.grow(len(trace))
-        labels = engine._minimal_labels()
+        labels = engine._visits.fewest()
         assert labels
         chart = engine._chart
-        control = engine._streets.control(chart)
+        control = engine._paths.control(chart)
         control.add("base", [], facts.settled_labels(enumerate(labels)))
         control.ground([("base", []), ("contrary", [])])
-        contrary, _ = next(engine._answers(facts.read_contrary, "ignore", 1, control=control))
+        contrary, _ = next(engine.asker.answers(facts.read_contrary, "ignore", 1, control=control))
         contradicted += len(contrary)
 
         def atoms(name: str, arity: int, control: clingo.Control = control) -> set[tuple[int, ...]]:
@@ -418,24 +422,24 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
             control.add("visits", [], "\n".join(f":- not same({i},{j},{r})." for i, j, r in pairs))
             street = ("street", facts.numbers(*chart.facing[labels.index(dstate)], 0))
             control.ground([("visits", []), ("more", facts.numbers(0)), ("sides", []), ("streets", facts.numbers(0)), street])
-            allowed = next(engine._answers(lambda _: True, "ignore", 1, control=control), False)
+            allowed = next(engine.asker.answers(lambda _: True, "ignore", 1, control=control), False)
             assert not (allowed and dstate in contrary)
             assert allowed or {y for x, y, _ in segments if x == dstate} & set(contrary)
     assert contradicted > 10
 
 
 def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
-    """Stopped while streets are sought for the fewest dstates, and while the dstates are."""
+    """LimitError while streets are sought for the fewest dstates, and while the dstates are."""
     walk = maze(3, 3, steps=200, seed=1, stars=True)
-    with patch.object(FramedEngine, "_fitting", side_effect=KeyboardInterrupt), patch.object(engine, "FIRST_PREFIXES", 300):
+    with patch.object(FramedEngine, "_all_with_paths", side_effect=KeyboardInterrupt), patch.object(engine, "FIRST_PREFIXES", 300):
         search = Search(walk.trace, Theory.topological())
-        search._start = 201
+        search._prefixes.start = 201
         solution = search.solution(tuple(search))
     assert solution.status is Status.FEASIBLE
     assert solution.cost
     assert solution.cost.dstates == solution.bound.dstates == 36
     assert check(walk.trace, solution.maps[0], Theory.topological()) == ()
-    with patch.object(FramedEngine, "_minimal_labels", side_effect=KeyboardInterrupt):
+    with patch.object(VisitLabels, "fewest", side_effect=KeyboardInterrupt):
         solution = solve(walk.trace, Theory.topological())
     assert solution.status is Status.FEASIBLE
     assert check(walk.trace, solution.maps[0], Theory.topological()) == ()
@@ -459,21 +463,21 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
     fewest: set[int] = set()
     stopped = 0
     for stop in range(0, 50, 2):
-        engine = Search(trace, Theory.topological())._engine
+        engine = Search(trace, Theory.topological())._prefixes.engine
         assert isinstance(engine, FramedEngine)
         engine.grow(len(trace))
         checks = iter(range(1, 10**6))
 
         def check_once(ahead: float = 0.0, stop: int = stop, checks: Iterator[int] = checks) -> None:
             if next(checks) == stop:
-                raise Stopped("time limit")
+                raise LimitError("time limit")
 
-        with patch.object(engine._watch, "check", check_once):
+        with patch.object(engine.asker.watch, "check", check_once):
             try:
-                labels = engine._minimal_labels()
-            except Stopped:
+                labels = engine._visits.fewest()
+            except LimitError:
                 stopped += 1
-                labels = engine._minimal_labels()
+                labels = engine._visits.fewest()
         assert labels is not None
         assert len(set(labels)) == engine.bound
         fewest.add(len(set(labels)))
@@ -485,12 +489,12 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
     """Else the time that is kept for any map would be spent on the engine of a shorter prefix, and its map be taken for the whole trace's."""
     walk = maze(3, 3, steps=120, seed=1, stars=True)
     search = Search(walk.trace, Theory.topological(), limit=30)
-    engine = search._engine
+    engine = search._prefixes.engine
     engine.grow(40)
-    with patch.object(FramedEngine, "_charted", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
+    with patch.object(engine._visits, "_charted", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
         engine.grow(121)
     assert engine.size == 40
-    search._start = 121
+    search._prefixes.start = 121
     maps = tuple(search)
     assert search.status is Status.OPTIMAL
     for ssh_map in maps:
@@ -501,11 +505,11 @@ def test_ctrl_c_in_the_last_part_of_the_time_leaves_no_engine_to_go_on_with() ->
     """Perhaps clingo was told half of a core: what it would say then of the longer trace may be wrong."""
     trace = maze(3, 3, steps=80, seed=1, stars=True).trace
     search = Search(trace.prefix(70), Theory.topological(), limit=30)
-    with patch.object(Search, "_minimise", side_effect=[Stopped("time limit"), KeyboardInterrupt]):
+    with patch.object(Prefixes, "minimise", side_effect=[LimitError("time limit"), KeyboardInterrupt]):
         assert [check(search.trace, ssh_map, search.theory) for ssh_map in search] == [()]
     assert search.stopped == "interrupted"
     later = Search(trace, Theory.topological(), maps=0, after=search)
-    assert later._engine is not search._engine
+    assert later._prefixes.engine is not search._prefixes.engine
     assert set(later) == set(solve(trace, maps=0).maps)
 
 
@@ -514,10 +518,10 @@ def test_an_error_leaves_no_engine_to_go_on_with() -> None:
     first = Search(trace.prefix(60), Theory.topological())
     list(first)
     second = Search(trace.prefix(70), Theory.topological(), after=first)
-    assert second._engine is first._engine
-    with patch.object(FramedEngine, "_fewest", side_effect=MemoryError), pytest.raises(MemoryError):
+    assert second._prefixes.engine is first._prefixes.engine
+    with patch.object(VisitLabels, "_best_answer", side_effect=MemoryError), pytest.raises(MemoryError):
         list(second)
-    assert Search(trace, Theory.topological(), after=first)._engine is not first._engine
+    assert Search(trace, Theory.topological(), after=first)._prefixes.engine is not first._prefixes.engine
 
 
 def test_maps_of_a_known_cost_are_listed_for_the_whole_trace() -> None:
@@ -525,7 +529,7 @@ def test_maps_of_a_known_cost_are_listed_for_the_whole_trace() -> None:
     trace = maze(3, 3, steps=70, seed=44, stars=True).trace
     first = Search(trace, Theory.topological(), maps=1)
     known = next(iter(first))
-    first.stopped = "interrupted"
+    first._known.stopped = "interrupted"
     again = Search(trace, Theory.topological(), maps=0, after=first, minimal=known)
     assert not again.prefix
     assert set(again) == set(solve(trace, maps=0).maps)
@@ -570,9 +574,8 @@ def test_annealing_finds_the_places_of_a_maze(seed: int) -> None:
 @given(framed_traces(), st.integers(1, 20))
 def test_a_guess_holds_the_stars(trace: Trace, sweeps: int) -> None:
     """Also one that is not sure: visits of a place have the same star in its frame."""
-    try:
-        chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
-    except NoFrame:
+    chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
+    if chart is None:
         return
     with patch.multiple(annealing, ANNEALED=((0.5, sweeps),), LAST=1):
         _, guess = next(attempts(chart))
@@ -595,8 +598,8 @@ def framed_engine(trace: Trace, theory: Theory) -> FramedEngine:
     resolved = theory.resolve(trace)
     watch = Watch()
     watch.start()
-    found = FramedEngine(trace, resolved, watch, Log(trace, resolved), Speedups())
-    found._chart = Chart.framed(trace, found._log, len(trace))
+    found = FramedEngine(engine.Task.of(trace, resolved, watch))
+    found._visits.chart = Chart.framed(trace, found._task.log)
     return found
 
 
@@ -614,7 +617,7 @@ def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: T
         labels = node_labels(ssh_map, chart)
         loosened = numbered(data.draw(loosened_labels(labels)))
         loose = [node for node in range(len(labels)) if loosened.count(loosened[node]) == 1]
-        told = asked._streets.told(chart, loosened, loose)
+        told = asked._paths.told(chart, loosened, loose)
         assert told is not None
         apart, one = told
         place = {s.id: s.place for s in ssh_map.dstates}
@@ -626,22 +629,21 @@ def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: T
 @given(framed_traces(), framed_theories(), st.lists(st.integers(-1, 4), min_size=9, max_size=9), st.booleans())
 def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[int], told: bool) -> None:
     """Of the causal axioms; and where single streets fit it, others do."""
-    try:
-        asked = framed_engine(trace, theory)
-    except NoFrame:
-        return
+    asked = framed_engine(trace, theory)
     chart = asked._chart
+    if chart is None:
+        return
     apart = chart.apart()
     start = guess[: len(chart.seen)]
-    labels = asked._streets.labels_near(chart, apart, start) if told else merged_near(apart, chart.links, start)
+    labels = asked._paths.labels_near(chart, apart, start) if told else merged_near(apart, chart.links, start)
     if labels is None:
         return
     assert chart.is_map(labels)
     assert not any(apart[i, j] for i in range(len(labels)) for j in range(i) if labels[i] == labels[j])
-    singles = asked._streets.has_single(chart, labels)
+    singles = asked._paths.has_single(chart, labels)
     if singles or not told:
         with patch.object(framed, "MANY_DSTATES", 100):
-            assert (asked._some_streets(labels)[0] is not None) >= singles
+            assert (asked._some_paths(labels) is not None) >= singles
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -654,7 +656,7 @@ def test_a_true_guess_stays_as_it_is(seed: int) -> None:
     apart = chart.apart()
     assert merged_near(apart, chart.links, truth) == truth
     some = [-1 if 20 <= node < 60 else label for node, label in enumerate(truth)]
-    assert asked._streets.labels_near(chart, apart, some) == truth
+    assert asked._paths.labels_near(chart, apart, some) == truth
 
 
 @pytest.mark.parametrize(("size", "steps", "seed"), [(5, 300, 0), (6, 300, 2), (8, 600, 1)])
@@ -662,7 +664,7 @@ def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, s
     """Where the causal axioms do not show that they are two, but streets do."""
     walk = maze(size, size, steps=steps, seed=seed, stars=True)
     asked = framed_engine(walk.trace, Theory.topological())
-    chart, known = asked._chart, asked._streets
+    chart, known = asked._chart, asked._paths
     truth = numbered([walk.truth[chart.node_of.index(node)] for node in range(len(chart.seen))])
     apart = chart.apart()
     nodes = np.array(truth)
@@ -690,15 +692,15 @@ def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, s
 def test_a_guess_begins_sooner_under_a_short_limit(limit: float | None, waited: float, begins: bool) -> None:
     """But not where there is no time for one, as at a step of the online mapper."""
     asked = framed_engine(maze(2, 2, steps=20, seed=0, stars=True).trace, Theory.topological())
-    asked._visits = set()
+    asked._visits._visits = set()
     if limit is not None:
-        asked._watch.shorten(limit)
+        asked.asker.watch.shorten(limit)
     with (
-        patch.object(FramedEngine, "_has_processors", lambda _: True),
+        patch.object(engine.Task, "has_processors", True),
         patch.object(FramedEngine, "_search_beside") as begun,
         patch.object(Watch, "elapsed", lambda _: waited),
     ):
-        assert not asked._has_news()
+        assert not asked._should_interrupt()
     assert begun.called == begins
 
 
@@ -710,19 +712,19 @@ def test_labels_that_take_too_long_to_try_are_left() -> None:
 
     def known() -> tuple[list[Found], bool | None]:
         found = []
-        tries = asked._known_if_it_has_streets(labels)
+        tries = asked._known_if_it_has_paths(labels)
         while True:
             try:
                 found.append(next(tries))
             except StopIteration as end:
                 return found, end.value
 
-    asked._known = None
-    asked._watch.shorten(50.0)
-    with patch.object(FramedEngine, "_soon_streets", lambda *_: None):
+    asked._visits.known = None
+    asked.asker.watch.shorten(50.0)
+    with patch.object(FramedEngine, "_paths_found_soon", lambda *_: None):
         with patch.object(FramedEngine, "_preparing", 100.0):
             assert known() == ([], None)
-        assert asked._known is None
+        assert asked._visits.known is None
         found, fits = known()
     assert fits
     assert len(found) == 1
@@ -734,7 +736,8 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, mo
     """Annealing ends early, so some travels do not lead where they should."""
     walk = maze(6, 6, steps=1200, seed=1, stars=True, loops=loops)
     asked = framed_engine(walk.trace, Theory.topological())
-    chart = asked._charted(len(walk.trace))
+    chart = asked._charted(len(walk.trace), None)
+    assert chart
     failed: list[int] = []
 
     def counted(*arguments: object) -> Iterator[tuple[int, Guess]]:
@@ -743,26 +746,27 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, mo
             yield wrong, guess
 
     with patch.object(annealing, "ANNEALED", ((0.5, 100),)), patch.object(streets, "attempts", counted):
-        labels = asked._streets.guessed_labels(chart, Watch())
+        labels = asked._paths.guessed_labels(chart, Watch())
     assert failed[0] > 0
-    assert asked._streets.has_single(chart, labels)
+    assert asked._paths.has_single(chart, labels)
     assert len(set(labels)) < most * len(set(walk.truth))
 
 
 def test_a_guess_leaves_a_small_map_when_time_is_over() -> None:
     """The robot was in 88 dstates; the sketch that there is without the guess has 1,529."""
     walk = maze(5, 5, steps=1600, seed=1, stars=True)
-    asked = FramedEngine._minimal_labels
+    fewest, is_open = VisitLabels.fewest, []
 
-    def interrupted(self: FramedEngine, until: Callable[[], bool] = lambda: False) -> list[int] | None:
-        if self._guessed:
+    def interrupted(self: VisitLabels, until: Callable[[], bool]) -> object:
+        if is_open:
             raise KeyboardInterrupt
-        return asked(self, until)
+        is_open.append(fewest(self, until) is OPEN)
+        return OPEN
 
     with (
         patch.multiple(framed, GUESS_FIRST=-1.0, SOON=-1.0),
-        patch.object(FramedEngine, "_has_processors", lambda _: False),
-        patch.object(FramedEngine, "_minimal_labels", interrupted),
+        patch.object(engine.Task, "has_processors", False),
+        patch.object(VisitLabels, "fewest", interrupted),
     ):
         solution = solve(walk.trace, Theory.topological())
     assert solution.status is Status.FEASIBLE

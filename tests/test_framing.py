@@ -13,12 +13,14 @@ from instances import maze
 from strategies import theories, traces
 
 from ssh_abduction import OnlineMapper, Search, Speedups, SSHMap, Status, Theory, Trace, solve
-from ssh_abduction.asp.limits import Paused, Stopped, Watch
+from ssh_abduction.asp.limits import LimitError, StageTimeError, Watch
 from ssh_abduction.engines import framing
 from ssh_abduction.engines.framing import maps_with_frames
 from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import check
+from ssh_abduction.solver import candidates, prefixes
 from ssh_abduction.solver import search as solver
+from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.theory.speedups import SPEEDUPS, row
 
 THEORIES = {
@@ -59,9 +61,9 @@ def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
     """Sought before anything else, so that it is known whenever a prefix has as cheap a map."""
     trace = data.draw(traces(), label="trace")
     theory = data.draw(theories(trace), label="theory")
-    first = data.draw(st.sampled_from([1, 3, solver.FIRST_PREFIX]), label="first prefix")
+    first = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
     expected = solve(trace, theory, maps=0, speedups=Speedups.without(SPEEDUPS))
-    with patch.multiple(solver, FRAME_AFTER=-1.0, FEW_STEPS=0, FIRST_PREFIX=first):
+    with patch.multiple(solver, FRAME_AFTER=-1.0, FEW_STEPS=0), patch.object(prefixes, "FIRST_PREFIX", first):
         found = solve(trace, theory, maps=0, speedups=Speedups.without("names"))
     assert found.status is expected.status
     assert found.complete
@@ -76,7 +78,7 @@ def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
 def test_a_maze_without_stars_has_a_small_map_before_the_proof(theory: Theory) -> None:
     """In the second part of its search it is interrupted at once; the robot was in 32 dstates."""
     walk = maze(3, 3, steps=400, seed=0)
-    with patch.object(Search, "_find_cost", side_effect=[Paused, KeyboardInterrupt]):
+    with patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, KeyboardInterrupt]):
         solution = solve(walk.trace, theory)
     assert (solution.status, solution.stopped, solution.count) == (Status.FEASIBLE, "interrupted", 1)
     assert solution.cost
@@ -87,7 +89,7 @@ def test_a_maze_without_stars_has_a_small_map_before_the_proof(theory: Theory) -
 def test_a_maze_of_loops_has_a_map_smaller_than_a_sketch() -> None:
     trace = maze(3, 3, steps=400, seed=1, loops=0.5).trace
     sketched = solve(trace, limit=1e-9)
-    with patch.object(Search, "_find_cost", side_effect=[Paused, KeyboardInterrupt]):
+    with patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, KeyboardInterrupt]):
         found = solve(trace)
     assert found.cost
     assert sketched.cost
@@ -97,13 +99,13 @@ def test_a_maze_of_loops_has_a_map_smaller_than_a_sketch() -> None:
 def test_listing_is_not_paused() -> None:
     """Where the cost is found before it is time for frames."""
     trace = maze(2, 2, steps=30, seed=0).trace
-    listed = Search._minimal_maps
+    listed = Prefixes.minimal_maps
 
-    def slowly(self: Search) -> Iterator[SSHMap]:
-        self._watch._spent += 2 * solver.FRAME_AFTER
+    def slowly(self: Prefixes) -> Iterator[SSHMap]:
+        self._task.watch._spent += 2 * solver.FRAME_AFTER
         yield from listed(self)
 
-    with patch.object(Search, "_minimal_maps", slowly):
+    with patch.object(Prefixes, "minimal_maps", slowly):
         solution = solve(trace, maps=0)
     assert solution.complete
     assert set(solution.maps) == set(solve(trace, maps=0, speedups=Speedups.without("framing")).maps)
@@ -134,7 +136,9 @@ def test_while_a_robot_drives_the_time_is_clingos() -> None:
     assert check(trace, answer.maps[0], answer.theory) == ()
 
 
-@pytest.mark.parametrize("stop", [KeyboardInterrupt(), Stopped("time limit"), Stopped("interrupted")], ids=["ctrl-c", "limit", "interrupt"])
+@pytest.mark.parametrize(
+    "stop", [KeyboardInterrupt(), LimitError("time limit"), LimitError("interrupted")], ids=["ctrl-c", "limit", "interrupt"]
+)
 def test_what_ends_it_leaves_its_last_map_and_no_thread(stop: BaseException) -> None:
     """Its own limit ends it alone; Ctrl-C the whole search."""
     walk = maze(3, 3, steps=120, seed=0)
@@ -150,7 +154,7 @@ def test_what_ends_it_leaves_its_last_map_and_no_thread(stop: BaseException) -> 
 
     with (
         patch.object(framing, "maps_with_frames", stopped),
-        patch.object(Search, "_find_cost", side_effect=[Paused, Stopped("memory limit")]),
+        patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, LimitError("memory limit")]),
     ):
         maps = tuple(search)
     assert search.stopped == ("memory limit" if str(stop) == "time limit" else "interrupted")
@@ -160,8 +164,8 @@ def test_what_ends_it_leaves_its_last_map_and_no_thread(stop: BaseException) -> 
 
 def test_a_pause_comes_once() -> None:
     watch = started(60)
-    watch.pause_after(-1)
-    with pytest.raises(Paused):
+    watch.end_stage_after(-1)
+    with pytest.raises(StageTimeError):
         watch.check()
     watch.check()
 
@@ -177,9 +181,9 @@ def test_until_there_is_a_map_it_may_take_twice_as_long() -> None:
         left.append(watch.left())
         raise KeyboardInterrupt
 
-    with patch.object(framing, "maps_with_frames", timed), patch.object(Search, "_find_cost", side_effect=Paused):
+    with patch.object(framing, "maps_with_frames", timed), patch.object(Prefixes, "find_minimum", side_effect=StageTimeError):
         solve(walk.trace, limit=1000)
-    assert left[1] <= solver.FRAMING < left[0] <= 2 * solver.FRAMING
+    assert left[1] <= candidates.FRAMING < left[0] <= 2 * candidates.FRAMING
 
 
 def test_a_limit_gets_only_shorter() -> None:
@@ -187,7 +191,7 @@ def test_a_limit_gets_only_shorter() -> None:
     watch.shorten(70)
     watch.check()
     watch.shorten(-1)
-    with pytest.raises(Stopped):
+    with pytest.raises(LimitError):
         watch.check()
     unlimited = started()
     unlimited.shorten(50)

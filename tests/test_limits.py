@@ -18,7 +18,7 @@ from worlds import rectangle
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.asp.control import Control
-from ssh_abduction.asp.limits import Stopped, Watch, peak_memory
+from ssh_abduction.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.cli import workers
 from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.steps import certificate
@@ -59,7 +59,7 @@ def test_grounding_ends_with_the_limit() -> None:
     watch.start()
     control = Control((), watch.check)
     control.add("base", [], JOINS)
-    with pytest.raises(Stopped) as caught:
+    with pytest.raises(LimitError) as caught:
         control.ground()
     assert caught.value.reason == "time limit"
     assert watch.elapsed() < 5
@@ -86,7 +86,7 @@ def test_what_would_go_beyond_a_limit_is_not_begun(seconds: float, mebibytes: fl
     stopped = None
     try:
         watch.check(seconds, mebibytes)
-    except Stopped as stop:
+    except LimitError as stop:
         stopped = stop.reason
     assert stopped == reason
 

@@ -12,10 +12,10 @@ import pytest
 from benchmarks.instances import Walk, maze
 from ssh_abduction import Search, Theory, solve
 from ssh_abduction.asp.limits import Watch
-from ssh_abduction.engines import streets
+from ssh_abduction.engines import paths as streets
 from ssh_abduction.engines import visits as same
 from ssh_abduction.engines.framed import FramedEngine
-from ssh_abduction.engines.streets import Streets
+from ssh_abduction.engines.paths import Paths
 from ssh_abduction.judge.checker import check
 from ssh_abduction.steps.chart import Chart, FramedChart, numbered
 from ssh_abduction.steps.localising import Located, State, faced, located, states_of, tracked
@@ -91,9 +91,9 @@ def test_a_long_trace_is_solved_from_few_of_its_visits(seed: int) -> None:
     search = Search(trace, maps=0)
     with patch.object(same, "FIRST_PAIRS", 500):
         maps = tuple(search)
-    engine = search._engine
+    engine = search._prefixes.engine
     assert isinstance(engine, FramedEngine)
-    assert len(engine._visits) < 0.8 * len(engine._chart.stars)
+    assert len(engine._visits._visits) < 0.8 * len(engine._visits.chart.stars)
     expected = solve(trace, maps=0, speedups=Speedups.without("lazy"))
     assert search.complete
     assert set(maps) == set(expected.maps)
@@ -107,14 +107,14 @@ def test_the_beginning_of_a_long_trace_is_guessed(seed: int) -> None:
     walk = maze(3, 3, steps=700, seed=seed, stars=True)
     chart = charted(walk)
     guessed: list[int] = []
-    begun = Streets._guessed
+    begun = Paths._guessed
 
-    def counted(self: Streets, part: FramedChart, check: Callable[[], None]) -> list[int]:
+    def counted(self: Paths, part: FramedChart, check: Callable[[], None]) -> list[int]:
         guessed.append(len(part.stars))
         return begun(self, part, check)
 
-    asked = Streets(walk.trace, FRAMED)
-    with patch.object(streets, "FIRST_PAIRS", 300), patch.object(Streets, "_guessed", counted):
+    asked = Paths(walk.trace, FRAMED)
+    with patch.object(streets, "FIRST_PAIRS", 300), patch.object(Paths, "_guessed", counted):
         found = asked.guessed_labels(chart, Watch())
     assert guessed[0] < len(chart.stars) / 2
     assert all(later in {2 * earlier, len(chart.stars)} for earlier, later in pairwise(guessed))

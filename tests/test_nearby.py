@@ -17,14 +17,15 @@ from ssh_abduction import Speedups, Status, Theory, Trace, solve
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import Watch
 from ssh_abduction.engines import base as engine
-from ssh_abduction.engines import causal as named
+from ssh_abduction.engines import naming as named
 from ssh_abduction.engines import nearby
+from ssh_abduction.engines.causal import CausalEngine
 from ssh_abduction.engines.nearby import Beside, NearbySearch
 from ssh_abduction.guesses import annealing
 from ssh_abduction.guesses.annealing import annealed
 from ssh_abduction.judge.checker import check
 from ssh_abduction.solver import search as solver
-from ssh_abduction.steps.chart import Chart, NoFrame
+from ssh_abduction.steps.chart import Chart
 from ssh_abduction.steps.log import Log
 
 CAUSAL = Theory.causal()
@@ -83,7 +84,7 @@ def test_a_search_beside_another_changes_no_answer(trace: Trace, beside: bool, c
         patch.multiple(named, PATIENCE=0, CORES=cores, TRIES=data.draw(st.integers(1, 3), label="tries")),
         patch.object(named, "annealed", lambda *_, **__: Mock(labels=lambda _: guess)),
         patch.object(named.Chart, "turned", turned),
-        patch.object(named.NamedEngine, "_has_processors", lambda _: beside),
+        patch.object(engine.Task, "has_processors", beside),
     ):
         found = solve(trace, CAUSAL, maps=most)
     assert found.status is Status.OPTIMAL
@@ -161,9 +162,9 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
         """When there is a small map, the time is over."""
         best.append(len(set(self._labels)))
         limited.interrupt()
-        while not self._watch.interrupted:
+        while not self._asker.watch.interrupted:
             time.sleep(0.001)
-        self._watch.check()
+        self._asker.watch.check()
         yield []
         return "open"
 
@@ -173,7 +174,7 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
         patch.object(named, "annealed", lambda *_, **__: Mock(labels=lambda chart: _labels_of(chart, walk.truth, truth))),
         patch.object(NearbySearch, "_asked", stop),
         patch.multiple(named, PATIENCE=100, CORES=100),
-        patch.object(named.NamedEngine, "_has_processors", lambda _: beside),
+        patch.object(engine.Task, "has_processors", beside),
     ):
         solution = limited.solution(tuple(limited))
     assert solution.stopped == "interrupted"
@@ -186,10 +187,10 @@ def test_where_clingo_would_prepare_for_too_long_the_search_beside_goes_on() -> 
     """Which proves here what the other one was stopped at."""
     walk = maze(3, 3, steps=300, seed=0)
     expected = solve(walk.trace, CAUSAL).cost
-    check_ahead = named.NamedEngine._check_ahead
+    check_ahead = named.NamedLabels._check_ahead
     stopped = []
 
-    def stop(self: named.NamedEngine, seconds: float) -> None:
+    def stop(self: named.NamedLabels, seconds: float) -> None:
         if self._beside:
             stopped.append(self)
             seconds = math.inf
@@ -197,8 +198,8 @@ def test_where_clingo_would_prepare_for_too_long_the_search_beside_goes_on() -> 
 
     with (
         patch.multiple(named, PATIENCE=1),
-        patch.object(named.NamedEngine, "_has_processors", lambda _: True),
-        patch.object(named.NamedEngine, "_check_ahead", stop),
+        patch.object(engine.Task, "has_processors", True),
+        patch.object(named.NamedLabels, "_check_ahead", stop),
     ):
         solution = solve(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"), maps=1, limit=100)
     assert stopped
@@ -247,8 +248,7 @@ def test_what_goes_wrong_in_the_thread_is_raised_where_the_result_is_asked_for()
 )
 def test_no_frame_is_guessed(views: str, actions: list[object]) -> None:
     trace = Trace.from_steps(views, actions)
-    with pytest.raises(NoFrame):
-        Chart.turned(trace, Log(trace, CAUSAL), len(trace))
+    assert Chart.turned(trace, Log(trace, CAUSAL), len(trace)) is None
 
 
 def test_a_chart_of_what_is_seen_around() -> None:
@@ -274,7 +274,7 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(first: int, 
     trace = maze(3, 3, steps=1600, seed=0).trace
     watch = Watch(100.0)
     watch.start()
-    long = named.NamedEngine(trace, CAUSAL, watch, Log(trace, CAUSAL), Speedups())
+    long = CausalEngine(engine.Task.of(trace, CAUSAL, watch))._named
     long.grow(len(trace))
     with patch.multiple(named, AT_ONCE=first, GUESSED=guessed):
         found = list(long._from_beginning(watch.check))
@@ -290,14 +290,14 @@ def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
     """The simplest first, so that it comes to an end before it was given all; the map is that of a guess at the beginning, or clingo's."""
     walk = maze(4, 4, steps=4000, seed=1, loops=0.3)
     given: list[int] = []
-    add = named.NamedEngine._add
+    add = named.NamedLabels.add
 
-    def counted(self: named.NamedEngine, links: list[tuple[int, int, int]]) -> None:
+    def counted(self: named.NamedLabels, links: list[tuple[int, int, int]]) -> None:
         add(self, links)
         given.append(len(self._links))
 
     expected = solve(walk.trace, CAUSAL)
-    with patch.multiple(named, AT_ONCE=1000, PATIENCE=10, MORE_LINKS=100), patch.object(named.NamedEngine, "_add", counted):
+    with patch.multiple(named, AT_ONCE=1000, PATIENCE=10, MORE_LINKS=100), patch.object(named.NamedLabels, "add", counted):
         found = solve(walk.trace, CAUSAL)
     assert found.status is expected.status is Status.OPTIMAL
     assert found.cost == expected.cost
@@ -308,12 +308,12 @@ def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
 def test_of_a_long_trace_as_much_is_taken_as_adds_to_the_clique() -> None:
     trace = maze(3, 3, steps=3000, seed=0).trace
     log = Log(trace, CAUSAL)
-    long = named.NamedEngine(trace, CAUSAL, Watch(100.0), log, Speedups())
-    long.size = 32
+    long = CausalEngine(engine.Task.of(trace, CAUSAL, Watch(100.0)))
+    long._named.size = 32
     with patch.object(engine, "AT_ONCE", 50), patch.object(named, "AT_ONCE", 50):
         size = long.next_size(32)
         assert long.next_size(10) == size
-        long.size = size
+        long._named.size = size
         assert long.next_size(size) == min(2 * size, 3001)
     sizes = [len(Chart.of_steps(log, steps).continuations.clique()) for steps in (size // 2, size, 3001)]
     assert sizes[0] < sizes[1] == sizes[2]

@@ -18,12 +18,12 @@ from strategies import TOYS, Toy, traces
 from worlds import ACTIONS
 
 from ssh_abduction import OnlineMapper, Speedups, SSHMap, Status, Theory, TheoryError, Trace, solve
-from ssh_abduction.engines.causal import NamedEngine
+from ssh_abduction.engines.causal import CausalEngine
 from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.explain import explain
 from ssh_abduction.judge import check
 from ssh_abduction.judge.checker import unchecked
-from ssh_abduction.solver import search
+from ssh_abduction.solver import judging, prefixes, search
 from ssh_abduction.solver.judging import InternalError
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs
@@ -52,7 +52,7 @@ def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.Dat
     allows = TOYS[0].allows if toy.rules not in theory.rules else toy.allows
     trace = data.draw(traces(max_steps=6), label="trace")
     mapper: OnlineMapper | None = None
-    with patch.multiple(search, FIRST_PREFIX=1, FEW_STEPS=0):
+    with patch.object(prefixes, "FIRST_PREFIX", 1), patch.object(search, "FEW_STEPS", 0):
         for steps in range(1, len(trace) + 1):
             prefix = trace.prefix(steps)
             counts, expected = minimal_maps(prefix, replace(theory, rules=()), allows)
@@ -207,7 +207,11 @@ def test_what_evidence_refuses_of_a_map_is_forbidden(name: str, data: st.DataObj
         return all(found[0].count(label) <= 2 for label in found[0])
 
     counts, expected = minimal_maps(trace, THEORIES[name], allows)
-    with patch.object(search, "evidence_of", lambda _: (NoLongReturns(),)), patch.multiple(search, FIRST_PREFIX=1, FEW_STEPS=0):
+    with (
+        patch.object(judging, "evidence_of", lambda _: (NoLongReturns(),)),
+        patch.object(prefixes, "FIRST_PREFIX", 1),
+        patch.object(search, "FEW_STEPS", 0),
+    ):
         solution = solve(trace, theory, maps=0)
     assert solution.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
     assert {key(ssh_map) for ssh_map in solution.maps} == expected
@@ -291,14 +295,14 @@ def test_what_is_asserted_is_told_to_the_engine_with_names() -> None:
     """More is then apart: the clique that dstates are pinned to is larger, and clingo need not find that out."""
     trace = Trace.from_steps("ab" * 20, ["travel"] * 39)
     cliques = []
-    grow = NamedEngine.grow
+    grow = CausalEngine.grow
 
-    def noted(self: NamedEngine, size: int) -> None:
+    def noted(self: CausalEngine, size: int) -> None:
         grow(self, size)
-        cliques.append(len(self.clique))
+        cliques.append(len(self._named.clique))
 
     theory = Theory.causal().replace(different=[(0, 2), (0, 4), (2, 4)])
-    with patch.object(NamedEngine, "grow", noted):
+    with patch.object(CausalEngine, "grow", noted):
         solution = solve(trace, theory, speedups=Speedups.without("prefixes"))
     assert cliques[-1] == 5  # steps 0, 2 and 4, and so 1 and 3, from which the same action leads to two of these
     assert solution.cost == solve(trace, theory, speedups=Speedups.without(SPEEDUPS)).cost

@@ -15,9 +15,9 @@ import pytest
 from instances import maze
 
 from ssh_abduction import Theory
-from ssh_abduction.asp.limits import Stopped, Watch, peak_memory
+from ssh_abduction.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.asp.process import in_process
-from ssh_abduction.engines.streets import Streets
+from ssh_abduction.engines.paths import Paths
 from ssh_abduction.steps.chart import Chart
 from ssh_abduction.steps.log import Log
 
@@ -94,7 +94,7 @@ def test_what_ends_the_search_ends_the_process(tmp_path: Path) -> None:
 
     waiting = threading.Thread(target=interrupt)
     waiting.start()
-    with pytest.raises(Stopped, match="interrupted"):
+    with pytest.raises(LimitError, match="interrupted"):
         in_process(write_again_and_again, path, watch=watch)
     waiting.join()
     assert not is_written(path)
@@ -120,7 +120,7 @@ in_process(write_again_and_again, Path({str(path)!r}), watch=Watch())
 
 
 def test_a_process_that_is_killed_stops_the_search() -> None:
-    with pytest.raises(Stopped):
+    with pytest.raises(LimitError):
         in_process(end_at_once, watch=Watch())
 
 
@@ -129,7 +129,7 @@ def test_what_is_left_of_the_memory_is_that_of_the_process() -> None:
     held = b"x" * (300 * 2**20)
     beside = Watch(beside=Watch(memory=peak_memory() + 200))
     assert in_process(use_memory, 10, watch=beside) == 10
-    with pytest.raises(Stopped, match="memory"):
+    with pytest.raises(LimitError, match="memory"):
         in_process(use_memory, 400, watch=beside)
     del held
 
@@ -137,7 +137,7 @@ def test_what_is_left_of_the_memory_is_that_of_the_process() -> None:
 def test_a_guess_is_the_same_in_another_process() -> None:
     trace = maze(3, 3, steps=300, seed=1, stars=True).trace
     theory = Theory.topological().resolve(trace)
-    streets, chart = Streets(trace, theory), Chart.framed(trace, Log(trace, theory))
+    streets, chart = Paths(trace, theory), Chart.framed(trace, Log(trace, theory))
     assert chart.misfits.any()  # which does not go along
     here = streets.guessed_labels(chart, Watch())
     assert in_process(streets.guessed_labels, chart, watch=Watch()) == here

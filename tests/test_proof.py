@@ -42,8 +42,8 @@ def test_a_certificate_is_worked_out_when_asked_for(length: int) -> None:
     trace = wandering(2, rooms=5, length=length, views=3)
     search = Search(trace, Theory.causal(), maps=1)
     solution = search.solution(tuple(search))
-    assert solution.evidence is not None
-    assert "certificate" not in vars(solution.evidence)
+    assert solution.basis is not None
+    assert "certificate" not in vars(solution.basis)
     log = Log(trace, search.theory)
     certificate = solution.certificate
     assert certificate is not None
@@ -61,7 +61,7 @@ def test_a_solution_travels_with_its_certificate(asked: bool) -> None:
         assert solution.certificate is not None
     copy = pickle.loads(pickle.dumps(solution))
     assert copy == solution
-    assert hash(copy.evidence) == hash(solution.evidence)
+    assert hash(copy.basis) == hash(solution.basis)
     assert copy.certificate == solution.certificate
     assert replace(solution, prefix=0).certificate == solution.certificate
     assert replace(solution, evidence=None) != solution
@@ -71,7 +71,7 @@ def test_a_solution_travels_with_its_certificate(asked: bool) -> None:
 def test_a_theory_without_what_it_rests_on_has_no_certificate() -> None:
     trace = wandering(2, rooms=5, length=5, views=3)
     solution = solve(trace, Theory.causal().replace(without=("deterministic",)))
-    assert (solution.evidence, solution.certificate) == (None, None)
+    assert (solution.basis, solution.certificate) == (None, None)
 
 
 def test_a_mapper_gives_a_certificate() -> None:

@@ -12,6 +12,7 @@ from strategies import FOREIGN, TOYS, theories, traces
 
 from ssh_abduction import solve
 from ssh_abduction.judge.checker import check
+from ssh_abduction.solver import prefixes
 from ssh_abduction.solver import search as solver
 from ssh_abduction.theory.theory import Count, Theory
 from ssh_abduction.trace import Trace
@@ -46,10 +47,10 @@ def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
     theory = data.draw(theories(trace), label="theory")
     # The traces are shorter than the solver's first prefix: a shorter one makes it replay and extend.
-    first_prefix = data.draw(st.sampled_from([1, 3, solver.FIRST_PREFIX]), label="first prefix")
-    first_paths = data.draw(st.sampled_from([1, 2, solver.FIRST_PATHS]), label="first paths")
+    first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
+    first_paths = data.draw(st.sampled_from([1, 2, prefixes.FIRST_PATHS]), label="first paths")
     few_steps = data.draw(st.sampled_from([0, solver.FEW_STEPS]), label="few steps")
-    with patch.multiple(solver, FIRST_PREFIX=first_prefix, FIRST_PATHS=first_paths, FEW_STEPS=few_steps):
+    with patch.multiple(prefixes, FIRST_PREFIX=first_prefix, FIRST_PATHS=first_paths), patch.object(solver, "FEW_STEPS", few_steps):
         agree(trace, theory)
 
 

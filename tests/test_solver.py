@@ -27,12 +27,14 @@ from benchmarks.instances import maze
 from ssh_abduction import Progress, Search, SolverError, Speedups, SSHMap, Status, Theory, TheoryError, Trace, TraceError, solve
 from ssh_abduction.asp.facts import links_of
 from ssh_abduction.engines import base as engine_module
-from ssh_abduction.engines.base import Found
-from ssh_abduction.engines.causal import NamedEngine
+from ssh_abduction.engines import stepwise
+from ssh_abduction.engines.base import Found, Task
+from ssh_abduction.engines.causal import CausalEngine
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.errors import SSHError
 from ssh_abduction.explain import Interrupted, explain
 from ssh_abduction.judge.checker import check
+from ssh_abduction.solver import prefixes
 from ssh_abduction.solver import search as solver_module
 from ssh_abduction.steps.log import Log, Outcome
 
@@ -81,9 +83,9 @@ def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
     """Every prefix is tried, from the shortest, so that replay has all chances to go wrong."""
     trace, theory = case
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(solver_module, "FIRST_PREFIX", 1)
-        patch.setattr(engine_module, "GROWTH", 1.0)
-        patch.setattr(solver_module, "FIRST_PATHS", 1)
+        patch.setattr(prefixes, "FIRST_PREFIX", 1)
+        patch.setattr(stepwise, "GROWTH", 1.0)
+        patch.setattr(prefixes, "FIRST_PATHS", 1)
         by_prefix = solve(trace, theory, maps=0)
     at_once = solve(trace, theory, maps=0, speedups=Speedups(prefixes=False))
     assert set(by_prefix.maps) == set(at_once.maps)
@@ -96,8 +98,8 @@ def test_streaming_lists_no_map_twice_and_misses_none(seed: int, monkeypatch: py
     """With nothing held back, maps stream from a prefix that is too short for others."""
     trace = wandering(seed, rooms=5, length=30, views=3)
     at_once = solve(trace, Theory.causal(), maps=0, speedups=Speedups(prefixes=False))
-    monkeypatch.setattr(solver_module, "FIRST_PREFIX", 2)
-    monkeypatch.setattr(solver_module, "HELD_BACK", 1)
+    monkeypatch.setattr(prefixes, "FIRST_PREFIX", 2)
+    monkeypatch.setattr(prefixes, "HELD_BACK", 1)
     streamed = solve(trace, Theory.causal(), maps=0)
     assert streamed.count == len(set(streamed.maps))
     assert set(streamed.maps) == set(at_once.maps)
@@ -385,13 +387,13 @@ def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
         def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
             self.left -= 1
             if not self.left:
-                raise solver_module.Stopped("time limit")
+                raise solver_module.LimitError("time limit")
 
     watch = Impatient(None, None, lambda: None)
-    engine = solver_module.StepEngine(trace, theory, watch, paths=10)
+    engine = solver_module.StepEngine(Task.of(trace, theory, watch), paths=10)
     engine.grow(4)
     watch.left = 2
-    with pytest.raises(solver_module.Stopped):
+    with pytest.raises(solver_module.LimitError):
         engine.grow(len(trace))
     assert 4 < engine.size < len(trace)
     engine.grow(len(trace))
@@ -404,15 +406,15 @@ def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
 def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPatch) -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
     search = Search(drive(*TOURS["comb"]), theory, maps=0)
-    honest = search._engine.maps_of_cost
+    honest = search._prefixes.engine.maps_of_cost
 
     def interrupted(cost: tuple[int, ...], enough: int) -> Iterator[object]:
         for number, found in enumerate(honest(cost, enough)):
             if number == 200:
-                raise solver_module.Stopped("interrupted")
+                raise solver_module.LimitError("interrupted")
             yield found
 
-    monkeypatch.setattr(search._engine, "maps_of_cost", interrupted)
+    monkeypatch.setattr(search._prefixes.engine, "maps_of_cost", interrupted)
     maps = tuple(search)
     solution = search.solution(maps)
     assert (solution.count, len(set(maps)), solution.complete, solution.stopped) == (200, 200, False, "interrupted")
@@ -420,20 +422,20 @@ def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_stop_while_the_prefix_grows_gives_the_maps_that_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(solver_module, "FIRST_PREFIX", 2)
+    monkeypatch.setattr(prefixes, "FIRST_PREFIX", 2)
     given = []
     for seed in (1, 4, 6):
         trace = wandering(seed, rooms=4, length=14, views=2)
         every = set(solve(trace, Theory.causal(), maps=0).maps)
         search = Search(trace, Theory.causal(), maps=0)
-        grow = search._engine.grow
+        grow = search._prefixes.engine.grow
 
         def stopped(size: int, search: Search = search, grow: Callable[[int], None] = grow) -> None:
             if search.status is Status.OPTIMAL:
-                raise solver_module.Stopped("time limit")
+                raise solver_module.LimitError("time limit")
             grow(size)
 
-        monkeypatch.setattr(search._engine, "grow", stopped)
+        monkeypatch.setattr(search._prefixes.engine, "grow", stopped)
         maps = set(search)
         assert maps <= every
         assert search.stopped == "time limit"
@@ -535,14 +537,14 @@ def test_whether_there_is_one_more_map_is_not_sought_for_long() -> None:
     trace = maze(2, 2, steps=200, seed=0).trace
     every = solve(trace, Theory.causal(), maps=0)
     assert (every.complete, every.stopped) == (True, None)
-    listed = NamedEngine.maps_of_cost
+    listed = CausalEngine.maps_of_cost
 
-    def slow(self: NamedEngine, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
+    def slow(self: CausalEngine, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         yield from listed(self, cost, enough)
         while True:
-            self._watch.check()
+            self.asker.watch.check()
 
-    with patch.object(NamedEngine, "maps_of_cost", slow), patch.object(solver_module, "ONE_MORE", 0.01):
+    with patch.object(CausalEngine, "maps_of_cost", slow), patch.object(solver_module, "ONE_MORE", 0.01):
         search = Search(trace, Theory.causal(), maps=every.count, limit=100.0)
         asked_for = search.solution(tuple(search))
     assert set(asked_for.maps) == set(every.maps)

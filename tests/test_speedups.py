@@ -18,9 +18,9 @@ from strategies import traces
 
 from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, solve
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import Stopped
+from ssh_abduction.asp.limits import LimitError
 from ssh_abduction.engines import base as engine
-from ssh_abduction.engines import causal as named
+from ssh_abduction.engines import naming as named
 from ssh_abduction.engines.nearby import NearbySearch
 from ssh_abduction.guesses import annealing
 from ssh_abduction.guesses.annealing import annealed_steps
@@ -111,13 +111,13 @@ def test_each_speedup_off_alone(off: str, theory: Theory) -> None:
 def test_numbers_of_dstates_asked_for_one_by_one(seed: int, spares: int, off: str) -> None:
     """From the clique up, or from one dstate, with names so few that answers use the rest: the minimum, and its maps. Every other time with two threads."""
     trace = moore(6, 2, steps=40, seed=seed).trace
-    grow = named.NamedEngine.grow
+    grow = named.NamedLabels.grow
 
-    def grow_and_ask(engine: named.NamedEngine, size: int) -> None:
+    def grow_and_ask(engine: named.NamedLabels, size: int) -> None:
         """Such short traces are solved before there are enough conflicts."""
         if size != engine.size:
             grow(engine, size)
-            engine._add(engine._chart.links)
+            engine.add(engine.chart.links)
             engine._hard = seed % 2 == 0
             engine._ask_one_by_one()
 
@@ -125,7 +125,7 @@ def test_numbers_of_dstates_asked_for_one_by_one(seed: int, spares: int, off: st
     with (
         patch.object(named, "SPARES", spares),
         patch.object(engine, "FIRST_PREFIXES", len(trace)),
-        patch.object(named.NamedEngine, "grow", grow_and_ask),
+        patch.object(named.NamedLabels, "grow", grow_and_ask),
     ):
         found = solve(trace, Theory.causal(), maps=0, limit=30, speedups=Speedups.without(off))
         some = solve(trace, Theory.causal(), maps=3, limit=30, speedups=Speedups.without(off))
@@ -153,7 +153,7 @@ def test_as_many_maps_as_asked_for(most: int) -> None:
 @given(machines(most_steps=40))
 def test_merging_greedily_gives_a_map(trace: Trace) -> None:
     theory = Theory.causal()
-    with patch.object(named.NamedEngine, "grow", side_effect=KeyboardInterrupt), patch.object(solver, "FEW_STEPS", 0):
+    with patch.object(named.NamedLabels, "grow", side_effect=KeyboardInterrupt), patch.object(solver, "FEW_STEPS", 0):
         found = solve(trace, theory)
     assert found.status is Status.FEASIBLE
     assert check(trace, found.maps[0], theory) == ()
@@ -196,7 +196,7 @@ def test_a_search_without_greedy_merging_has_a_bound_when_time_is_over() -> None
     trace = Trace.from_steps("abcabd", ["travel"] * 5)
     with patch.object(solver, "FEW_STEPS", 0):
         search = Search(trace, Theory.causal(), speedups=Speedups.without("greedy"))
-    with patch.object(named.NamedEngine, "improving_maps", side_effect=KeyboardInterrupt):
+    with patch.object(named.NamedLabels, "improving", side_effect=KeyboardInterrupt):
         assert list(search) == []
     assert search.bound.dstates == 4 + 2  # a, b, c, d, and the first a and b, which lead to another c and d
 
@@ -235,7 +235,7 @@ def test_dstates_that_are_one_are_merged() -> None:
 def test_a_limit_leaves_a_map_of_merged_steps() -> None:
     """Twice as good as one that is made at once, where clingo takes its time and no guess is annealed."""
     walk = maze(5, 5, steps=1600, seed=0)
-    with patch.multiple(named, PATIENCE=1, CORES=1), patch.object(named.NamedEngine, "_ask_one_by_one", side_effect=KeyboardInterrupt):
+    with patch.multiple(named, PATIENCE=1, CORES=1), patch.object(named.NamedLabels, "_ask_one_by_one", side_effect=KeyboardInterrupt):
         solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,annealed,threads"))
     assert solution.status is Status.FEASIBLE
     assert solution.cost
@@ -262,14 +262,14 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
 @pytest.mark.parametrize("off", ["", "lazy"])
 def test_maps_found_before_a_limit_strikes_are_given(off: str) -> None:
     """Though they are held back until it is known that the links that clingo was given are enough; and the one that showed what is minimal, too."""
-    found = named.NamedEngine._all_of_bound
+    found = named.NamedLabels._all_of_bound
 
-    def stopped(self: named.NamedEngine, spares: int) -> Iterator[dict[int, int]]:
+    def stopped(self: named.NamedLabels, spares: int) -> Iterator[dict[int, int]]:
         yield from islice(found(self, spares), 3)
-        raise Stopped("time limit")
+        raise LimitError("time limit")
 
     walk = maze(3, 3, steps=200, seed=0)
-    with patch.object(named.NamedEngine, "_all_of_bound", stopped):
+    with patch.object(named.NamedLabels, "_all_of_bound", stopped):
         solution = solve(walk.trace, Theory.causal(), maps=100, speedups=Speedups.without(off))
     assert (solution.status, solution.stopped) == (Status.OPTIMAL, "time limit")
     assert solution.count == len(set(solution.maps)) >= 3

@@ -12,14 +12,13 @@ from instances import maze
 from strategies import traces
 
 from ssh_abduction import Search, Speedups, Status, Theory, Trace, solve
-from ssh_abduction.asp.limits import Watch
-from ssh_abduction.engines import causal as named
 from ssh_abduction.engines import frameless as ways
-from ssh_abduction.engines.frameless import WaysEngine
+from ssh_abduction.engines import naming as named
+from ssh_abduction.engines.base import Task
+from ssh_abduction.engines.frameless import FramelessEngine
 from ssh_abduction.judge.checker import check
 from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.solver import search as solver
-from ssh_abduction.steps.log import Log
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -53,7 +52,7 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
         return  # the engine is asked only where some map is known
     with patch.multiple(named, SPARES=spares, PATIENCE=patience, CORES=cores), patch.object(ways, "CONTRARY", contrary):
         known = data.draw(st.sampled_from([None, expected.maps[0].labels]), label="known")
-        engine = WaysEngine(trace, theory, Watch(), Log(trace, theory), Speedups(), known)
+        engine = FramelessEngine(Task.of(trace, theory), known or ())
         engine.grow(len(trace))
         *_, best = engine.improving_maps()
         found = [found.map for found in engine.maps_of_cost(best.cost, 0)]
@@ -71,7 +70,7 @@ def test_a_maze_without_stars(off: str) -> None:
         search = Search(trace, maps=0, speedups=Speedups.without(off))
         found = search.solution(tuple(search))
     expected = solve(trace, maps=0, speedups=Speedups.without("ways"))
-    assert isinstance(search._engine, WaysEngine)
+    assert isinstance(search._prefixes.engine, FramelessEngine)
     assert set(found.maps) == set(expected.maps)
     assert found.complete
     assert found.certificate
@@ -87,7 +86,7 @@ def test_the_route_of_a_robot() -> None:
     with patch.multiple(solver, FRAME_AFTER=-1.0, FEW_STEPS=0):
         search = Search(trace, Theory(star="none"), maps=0)
         found = search.solution(tuple(search))
-    assert isinstance(search._engine, WaysEngine)
+    assert isinstance(search._prefixes.engine, FramelessEngine)
     assert found.cost
     assert found.cost.to_dict() == {"dstates": 19, "places": 9, "paths": 4}
     assert len(set(found.maps)) == found.count == 38
@@ -103,11 +102,11 @@ def test_few_of_many_maps() -> None:
     assert all(check(trace, ssh_map, every.theory) == () for ssh_map in every.maps)
 
 
-@pytest.mark.parametrize("name", ["_restart", "_fits", "_courses"])
+@pytest.mark.parametrize("name", ["forget", "why_not", "_courses"])
 def test_what_ends_it_leaves_the_map_with_frames(name: str) -> None:
     """Whatever it is at: the map that was known before is the answer."""
     trace = maze(2, 2, steps=120, seed=1).trace
-    with patch.object(solver, "FRAME_AFTER", -1.0), patch.object(WaysEngine, name, side_effect=KeyboardInterrupt):
+    with patch.object(solver, "FRAME_AFTER", -1.0), patch.object(ways.PlacesAndPaths, name, side_effect=KeyboardInterrupt):
         found = solve(trace)
     assert (found.status, found.stopped, found.count) == (Status.FEASIBLE, "interrupted", 1)
     assert check(trace, found.maps[0], found.theory) == ()
@@ -120,7 +119,7 @@ def test_a_robot_that_goes_on_where_that_ended() -> None:
     with patch.object(solver, "FRAME_AFTER", -1.0):
         search = Search(first, maps=0)
         before = search.solution(tuple(search))
-        assert isinstance(search._engine, WaysEngine)
+        assert isinstance(search._prefixes.engine, FramelessEngine)
         after = Search(trace, maps=0, after=search)
         found = after.solution(tuple(after))
     assert before.complete

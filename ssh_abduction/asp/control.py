@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import clingo
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import POLL, Stopped, Watch, peak_memory
+from ssh_abduction.asp.limits import POLL, LimitError, Watch, peak_memory
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import Speedups
 
@@ -134,28 +134,38 @@ class _Asked:
 
 
 class Asker:
-    """One clingo control, and the questions to it.
+    """One clingo control, and the questions to it under limits. What asks clingo has one of these.
 
-    bound   a proven lower bound on the count that is preferred first; None where nothing is known before a search ends
+    control  the control that is asked; a new one may take its place
+    watch    the limits; another search may go on under others
+    ground_seconds, solve_seconds  the time that clingo took so far
     """
 
     def __init__(self, watch: Watch) -> None:
-        self.bound: int | None = None
+        self.control = Control()
+        self.watch = watch
         self.ground_seconds = 0.0
         self.solve_seconds = 0.0
-        self._watch = watch
-        self._control = Control()
+
+    @contextmanager
+    def grounding_timed(self) -> Iterator[None]:
+        """What is done in here counts as grounding."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.ground_seconds += time.perf_counter() - began
 
     @property
     def grounding(self) -> Grounding:
         """The size of the program in the last call of clingo that came to an end. To ask takes a millisecond, as clingo tells all that it counts."""
         try:
-            program = self._control.statistics["problem"]["lp"]
+            program = self.control.statistics["problem"]["lp"]
         except (RuntimeError, KeyError):  # no call came to an end
             return Grounding(0, 0)
         return Grounding(int(program["rules"]), int(program["atoms"]))
 
-    def _answers(
+    def answers(
         self,
         read: Callable[[clingo.Model], Answer],
         mode: str,
@@ -180,7 +190,7 @@ class Asker:
         ahead      let clingo search for the next answer while the caller uses this one
         """
         project = "project" if not mode.startswith("opt") else "no"
-        with self._solving(control or self._control, assumptions, mode, models, project, conflicts, on_bound) as handle:
+        with self._solving(control or self.control, assumptions, mode, models, project, conflicts, on_bound) as handle:
             handle.resume()
             while True:
                 if not self._has_come(handle, until):
@@ -195,7 +205,7 @@ class Asker:
                 if not ahead:
                     handle.resume()
 
-    def _verdict(
+    def verdict(
         self,
         read: Callable[[clingo.Model], Answer],
         assumed: Sequence[int],
@@ -204,7 +214,7 @@ class Asker:
         until: Callable[[], bool] = lambda: False,
     ) -> tuple[Answer | None, list[int] | None]:
         """An answer in which these literals are true, or else a core of them. Neither, where the limit of conflicts or `until` ended the search."""
-        with self._solving(self._control, assumed, mode, 1, "no", conflicts) as handle:
+        with self._solving(self.control, assumed, mode, 1, "no", conflicts) as handle:
             if not self._has_come(handle, until):
                 return None, None
             model = handle.model()
@@ -233,7 +243,7 @@ class Asker:
         configuration.opt_mode, configuration.models, configuration.project = mode, models, project
         configuration.solve_limit = f"{conflicts},-1"
         if isinstance(control, Control):
-            self._watch.check(control.preparing[0] * control.seconds, control.preparing[1] * control.mebibytes)
+            self.watch.check(control.preparing[0] * control.seconds, control.preparing[1] * control.mebibytes)
             control.seconds = control.mebibytes = 0.0
         began = time.perf_counter()
         with ExitStack() as stack:
@@ -252,10 +262,10 @@ class Asker:
         began = time.perf_counter()
         try:
             while not handle.wait(POLL):
-                self._watch.check()
+                self.watch.check()
                 if until():
                     return False
-            self._watch.check()
+            self.watch.check()
             return True
         finally:
             self.solve_seconds += time.perf_counter() - began
@@ -273,10 +283,10 @@ def mapped(function: Callable[[Answer], Made], answers: Generator[Answer, None, 
 
 
 def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
-    """How a search ended. Raises Stopped if it was interrupted from outside, and not ended by the limit of conflicts."""
+    """How a search ended. Raises LimitError if it was interrupted from outside, and not ended by the limit of conflicts."""
     result = handle.get()
     if result.interrupted and conflicts < 0:
-        raise Stopped("interrupted")
+        raise LimitError("interrupted")
     return result
 
 

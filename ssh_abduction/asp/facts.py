@@ -381,13 +381,22 @@ def forbidden_pairs(
     listed  the rule holds only while answers up to this batch are listed (default always)
     """
     body = [*(f"same({i},{j},{r})" for i, j, r in pairs), *(f"not same({i},{j},{r})" for i, j, r in different)]
-    return f":- {', '.join(body if listed is None else [f'listed({listed})', *body])}."
+    return f":- {', '.join(['#true', *body] if listed is None else [f'listed({listed})', *body])}."
 
 
 def forbidden_equalities(equalities: Iterable[Equality]) -> str:
     """The rule that these equalities of steps do not all hold."""
     atoms = [f"same{'' if e.of == 'dstate' else '_place'}({min(e.first, e.second)},{max(e.first, e.second)})" for e in equalities]
     return f":- {', '.join(atoms)}."
+
+
+def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
+    """The rule that these pairs of steps with names are not all one dstate. At a rest steps need not be one.
+
+    number  another one for each such rule
+    """
+    together = [f"together({number},{k}) :- is({i},S), is({j},S), not rest(S)." for k, (i, j) in enumerate(pairs)]
+    return "\n".join([*together, f":- {', '.join(f'together({number},{k})' for k in range(len(pairs)))}."])
 
 
 _number = cache(Number)  # takes half the time of making a number anew, where there are many

@@ -21,15 +21,15 @@ TICK = 0.5
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
 
 
-class Stopped(Exception):  # noqa: N818 - not an error
-    """A limit is over, or the search was interrupted: `reason` says which."""
+class LimitError(Exception):
+    """A limit of a search is over, or somebody interrupted it. What is known by then is the answer."""
 
     def __init__(self, reason: Stop) -> None:
         self.reason = reason
 
 
-class Paused(Exception):  # noqa: N818 - not an error
-    """The time after which the search wanted to do something else first is over (`Watch.pause_after`)."""
+class StageTimeError(Exception):
+    """The time is over that one stage of a search has: the next stage begins."""
 
 
 class Watch:
@@ -58,7 +58,7 @@ class Watch:
         self._memory = memory
         self._started: float | None = None
         self._spent = 0.0
-        self._pause_at = math.inf
+        self._stage_ends = math.inf
         self.interrupted = False
 
     def start(self) -> None:
@@ -90,9 +90,9 @@ class Watch:
         """From now on the time limit is this, if that is less."""
         self._limit = self._allowed = seconds if self._limit is None else min(seconds, self._limit)
 
-    def pause_after(self, seconds: float) -> None:
-        """Let `check` raise Paused, once, when so much time was spent."""
-        self._pause_at = seconds
+    def end_stage_after(self, seconds: float) -> None:
+        """Let `check` raise StageTimeError, once, when so much time was spent."""
+        self._stage_ends = seconds
 
     def elapsed(self) -> float:
         return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
@@ -104,17 +104,17 @@ class Watch:
         mebibytes  memory that it will take
         """
         if self.interrupted:
-            raise Stopped("interrupted")
+            raise LimitError("interrupted")
         if self.elapsed() > self._next_tick:
             self._next_tick = self.elapsed() + TICK
             self._on_tick()
         if not self.allows(ahead):
-            raise Stopped("time limit")
+            raise LimitError("time limit")
         if self._memory is not None and peak_memory() + mebibytes > self._memory:
-            raise Stopped("memory limit")
-        if self.elapsed() > self._pause_at:
-            self._pause_at = math.inf
-            raise Paused
+            raise LimitError("memory limit")
+        if self.elapsed() > self._stage_ends:
+            self._stage_ends = math.inf
+            raise StageTimeError
 
     def allows(self, seconds: float) -> bool:
         """Whether there is time for something that cannot be interrupted and takes so many seconds."""

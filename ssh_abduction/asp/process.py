@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TypeVar
 
-from ssh_abduction.asp.limits import POLL, Stopped, Watch
+from ssh_abduction.asp.limits import POLL, LimitError, Watch
 
 Result = TypeVar("Result")
 
@@ -31,7 +31,7 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
     work, arguments  picklable; so are the result, and what work raises
     watch            ends the other process when a limit is over. What is left of its memory limit is the memory limit of the other process
 
-    Raises Stopped, also where something from outside ends the process.
+    Raises LimitError, also where something from outside ends the process.
     """
     code, answer = _run(work, arguments, watch)
     if code == 0:
@@ -41,7 +41,7 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
             raise error
         return result
     if code < 0:
-        raise Stopped("memory limit")  # a signal ended it, as the system does where memory is short
+        raise LimitError("memory limit")  # a signal ended it, as the system does where memory is short
     return work(*arguments, watch)
 
 

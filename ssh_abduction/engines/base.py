@@ -1,10 +1,10 @@
-"""Engines: what asks clingo for maps of a growing prefix of a trace."""
+"""What all engines have in common: what they are given, what they find, and the protocol that the search knows them by."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from typing import Self
+from typing import Protocol
 
 from ssh_abduction.asp.control import Asker, has_processors
 from ssh_abduction.asp.limits import Watch
@@ -15,9 +15,8 @@ from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
-GROWTH = 1.25  # a prefix grows at least by this factor, so that there are few
-FIRST_PREFIXES = 32  # steps of a prefix that an engine with a chart tries before AT_ONCE
-AT_ONCE = 8000  # steps that are compared in pairs; the matrix has the square of that many bytes
+FIRST_PREFIXES = 32  # An engine with a chart tries a prefix of so many steps before one of AT_ONCE steps: most traces are settled by then.
+AT_ONCE = 8000  # So many steps, at most, are compared in pairs: the matrix of the pairs has the square of that many bytes.
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,88 +54,105 @@ class Found:
         return Found(ssh_map, Cost.of(ssh_map).preferred_by(theory))
 
 
-class Engine(Asker):
-    """An asker whose control holds the axioms for the first `size` steps of a trace.
+@dataclass(frozen=True)
+class Task:
+    """What an engine works on.
 
-    paths   how many names for paths there are
-    clique  nodes that are pairwise apart (chart.py), if it needs to know some; in the causal theory they are steps
-    intact  False after an error that may have left the control half told
-    lists_least  whether maps_of_cost lists maps with the fewest dstates of the prefix alone
-    goes_on  whether it can go on with a trace that its own has grown to
+    trace     the whole trace
+    theory    with star settled
+    log       the trace as integers
+    watch     the limits of the search
+    speedups  those that hold for the theory
     """
 
-    lists_least = False
-    goes_on = True
+    trace: Trace
+    theory: Theory
+    log: Log
+    watch: Watch
+    speedups: Speedups
 
-    def __init__(self, trace: Trace, theory: Theory, watch: Watch, paths: int = 0) -> None:
-        super().__init__(watch)
-        self.intact = True
-        self.size = 0
-        self.paths = paths
-        self.clique: list[int] = []
-        self._trace = trace
-        self._theory = theory
+    @staticmethod
+    def of(trace: Trace, theory: Theory, watch: Watch | None = None, speedups: Speedups | None = None) -> Task:
+        """A task for all speed-ups that hold for a theory, or for these of them."""
+        speedups = (speedups or Speedups()).that_hold_for(theory)
+        return Task(trace, theory, Log(trace, theory), watch or Watch(), speedups)
+
+    @property
+    def has_processors(self) -> bool:
+        """Whether a search may use two threads."""
+        return has_processors(self.speedups)
+
+
+class Engine(Protocol):
+    """What the search may tell an engine, and ask it. An engine holds the axioms for the first `size` steps of a trace.
+
+    asker     what it asks clingo with
+    size      how many steps it was given
+    paths     how many names for paths it has
+    intact    False after an error that may have left its control half told
+    lists_least  whether it can list only maps with the fewest dstates of the prefix alone
+    goes_on   whether it can go on with a trace that its own has grown to
+    """
+
+    asker: Asker
+    intact: bool
+    lists_least: bool
+    goes_on: bool
+
+    @property
+    def size(self) -> int: ...
+
+    @property
+    def paths(self) -> int: ...
+
+    @property
+    def bound(self) -> int | None:
+        """Lower bound, proven, on the count that is preferred first; None where nothing is known before a search ends."""
+        ...
 
     def grow(self, size: int) -> None:
         """Let the prefix have `size` steps."""
-        raise NotImplementedError
+        ...
 
     def next_size(self, failed: int) -> int:
         """The size to grow to when the maps of the prefix do not explain step `failed`."""
-        return min(len(self._trace), max(failed + 1, int(self.size * GROWTH)))
+        ...
 
     @property
     def size_to_go_on(self) -> int:
         """The size to grow to first when a search was stopped and the trace has grown since."""
-        return self.size
+        ...
 
     def with_paths(self, paths: int) -> Engine:
         """Another engine, still for the empty prefix, with so many names for paths."""
-        raise NotImplementedError
+        ...
 
-    def over(self, trace: Trace, watch: Watch, log: Log) -> Engine:
+    def over(self, task: Task) -> Engine:
         """An engine for a trace that this one's has grown to, under other limits."""
-        raise NotImplementedError
+        ...
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         """Maps of the prefix, each better than the one before; where the iteration ends, the last one is minimal.
 
         most  what they cost at most, if that is known
         """
-        raise NotImplementedError
+        ...
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         """All maps of the prefix that cost this and no more; or `enough` of them, unless that is 0."""
-        raise NotImplementedError
+        ...
 
-    def forbid(self, equalities: Collection[Equality]) -> None:
-        """From now on no map has all of these equalities, of steps of the prefix."""
-        raise NotImplementedError
+    def forbid(self, equalities: Collection[Equality]) -> bool:
+        """From now on no map has all of these equalities, of steps of the prefix. False where the engine cannot be told of such ones."""
+        ...
 
     def settle(self) -> None:
         """End what is still under way in clingo, when a search is over: a thread left behind would abort Python at its end."""
+        ...
 
 
-class ChartedEngine(Engine):
-    """An engine that charts a prefix (chart.py)."""
-
-    def __init__(self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups) -> None:
-        super().__init__(trace, theory, watch)
-        self._log = log
-        self._speedups = speedups
-
-    def with_paths(self, paths: int) -> Self:
-        return type(self)(self._trace, self._theory, self._watch, self._log, self._speedups)
-
-    def next_size(self, failed: int) -> int:
-        steps = len(self._trace)
-        if self.size < FIRST_PREFIXES:
-            return min(steps, max(failed + 1, FIRST_PREFIXES))
-        return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * self.size, AT_ONCE))
-
-    @property
-    def size_to_go_on(self) -> int:
-        return self.next_size(self.size)
-
-    def _has_processors(self) -> bool:
-        return has_processors(self._speedups)
+def next_charted_size(size: int, failed: int, steps: int) -> int:
+    """The size to grow to, of an engine that charts a prefix: to chart all steps takes little, unless they are too many to be compared in pairs."""
+    if size < FIRST_PREFIXES:
+        return min(steps, max(failed + 1, FIRST_PREFIXES))
+    return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * size, AT_ONCE))

@@ -27,36 +27,31 @@ last answer first, and clingo searches for the next one while a map is made of i
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, combinations, islice
+from itertools import chain, islice
 
 import clingo
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.control import give_threads, mapped
+from ssh_abduction.asp.control import Asker, give_threads, mapped
 from ssh_abduction.asp.limits import Watch
 from ssh_abduction.asp.process import in_process
-from ssh_abduction.engines.base import Found
+from ssh_abduction.engines.base import Found, Task, next_charted_size
 from ssh_abduction.engines.nearby import Beside, NearbySearch
-from ssh_abduction.engines.streets import Streets
-from ssh_abduction.engines.visits import SameEngine, TakesLong, smaller
+from ssh_abduction.engines.paths import Paths
+from ssh_abduction.engines.refusing import all_accepted
+from ssh_abduction.engines.sides import FramedSides
+from ssh_abduction.engines.visits import OPEN, VisitLabels, smaller
 from ssh_abduction.guesses.merging import kept
-from ssh_abduction.steps.chart import Chart, FramedChart, NoFrame, numbered
-from ssh_abduction.steps.log import Log
-from ssh_abduction.theory import encodings
-from ssh_abduction.theory.speedups import Speedups
-from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
+from ssh_abduction.steps.chart import Chart, FramedChart, numbered
+from ssh_abduction.theory.evidence import Equality
 
 CLASHES = 30  # that clingo is told of in one go
 MANY_DSTATES = 50  # above which it is asked for single streets first
-ALL_STREETS = 0.1  # times as long as single ones, about, for each dstate, all take to ground
+ALL_PATHS = 0.1  # times as long as single ones, about, for each dstate, all take to ground
 PREPARED = 3.5  # times as long, until clasp has prepared to solve and can be stopped
 MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much to say: some forty rules for each of them
-# clasp's way to list answers in which no atom that is shown can be spared:
-SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 KEPT = 10  # controls of minimal namings that are kept until their maps are listed: each is some megabytes
 SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside,
 SOON_SHARE = 0.05  # or so much of a longer time limit, if that is less
@@ -76,72 +71,96 @@ class _Naming:
     control: clingo.Control | None
 
 
-class FramedEngine(SameEngine):
-    """The full theory with frames, fewest dstates first.
+@dataclass(frozen=True)
+class _Fitted:
+    """Labels that have paths, and a map that has these labels."""
 
-    soon  seconds without the fewest dstates after which a map near a guess is sought beside, at most; SOON if not given
-    """
+    found: Found
+    naming: _Naming
+
+
+class FramedEngine:
+    """The topological theory with frames, fewest dstates first."""
 
     lists_least = True
+    goes_on = True
 
-    def __init__(
-        self,
-        trace: Trace,
-        theory: Theory,
-        watch: Watch,
-        log: Log,
-        speedups: Speedups,
-        around: Mapping[int, Sequence[int]] | None = None,
-        soon: float | None = None,
-    ) -> None:
-        super().__init__(trace, theory, watch, log, speedups, around)
-        self._soon = SOON if soon is None else soon
-        self.paths = len(trace)  # names for paths are never short
+    def __init__(self, task: Task, around: Mapping[int, Sequence[int]] | None = None, soon: float = SOON) -> None:
+        """An engine for no steps yet.
+
+        around  as in `Chart.framed`, where steps have no stars
+        soon    seconds without the fewest dstates after which a map near a guess is sought beside, at most
+        """
+        self.asker = Asker(task.watch)
+        self.intact = True
+        self.paths = len(task.trace)  # names for paths are never short
+        self._task, self._around, self._soon = task, around, soon
+        self._sides = FramedSides(task.theory, self.asker)
+        self._visits = VisitLabels(task, self.asker, self._charted, self._sides)
+        self._size = 0
+        self._framed = True  # whether the visits fit their frames
+        self._forget()
+
+    def _forget(self) -> None:
+        """Nothing is known of maps of this prefix yet."""
         self._guess: list[int] | None = None  # labels of a map of the causal axioms
         self._guessed = False  # whether maps near the guess were sought
-        self._known_cost: tuple[int, ...] = ()  # of the known map, until better streets were looked for
-        self._beside: Beside | None = None  # a search that begins with the guess
-        self._tried: list[int] | None = None  # labels found there, the last of which it is known whether they have streets
+        self._known_cost: tuple[int, ...] = ()  # of the known map, until better paths were looked for
+        self._beside: Beside | None = None  # a search that begins with the guess, in another thread
+        self._tried: list[int] | None = None  # labels found there, the last of which it is known whether they have paths
         self._named: NearbySearch | None = None  # what searches there
-        self._street_seconds = 0.0  # what the last control for streets took, which cannot be stopped meanwhile
-        self._framed = True  # whether the visits fit their frames
+        self._path_seconds = 0.0  # what the last control for paths took, which cannot be stopped meanwhile
         self._best: tuple[tuple[int, ...], list[_Naming]] | None = None  # the minimal cost, and all namings that have it
 
     @property
-    def _streets(self) -> Streets:
-        return Streets(self._trace, self._theory, pinned=self._speedups.clique, check=self._watch.check)
+    def size(self) -> int:
+        return self._size
+
+    @property
+    def bound(self) -> int | None:
+        return self._visits.bound
+
+    @property
+    def _paths(self) -> Paths:
+        return Paths(self._task.trace, self._task.theory, pinned=self._task.speedups.clique, check=self.asker.watch.check)
+
+    def with_paths(self, paths: int) -> FramedEngine:
+        return FramedEngine(self._task, self._around, self._soon)
+
+    def over(self, task: Task) -> FramedEngine:
+        self._task, self.asker.watch = task, task.watch
+        self._visits.work_on(task)
+        self.asker.ground_seconds = self.asker.solve_seconds = 0.0
+        return self
+
+    def next_size(self, failed: int) -> int:
+        return next_charted_size(self.size, failed, len(self._task.trace))
+
+    @property
+    def size_to_go_on(self) -> int:
+        return self.next_size(self.size)
 
     def grow(self, size: int) -> None:
         if size != self.size:
-            self._best = None
             self._end_beside()
-            self._guess, self._guessed, self._named, self._tried = None, False, None, None
-            self._street_seconds = 0.0
-        try:
-            super().grow(size)
-        except NoFrame:
-            self._framed = False
-            self.size = size
+            self._forget()
+        self._size = 0  # until all of it is known
+        self._framed = self._visits.grow(size)
+        self._size = size
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         if not self._framed:
             return
-        best: Found | None = None
-        labels = yield from self._fewest_dstates()
-        while labels is not None:
-            best, named = self._some_streets(labels)
-            if best is not None:
-                yield best
-                break
-            self._forbid(labels)
-            labels = yield from self._fewest_dstates()
+        first = yield from self._first_with_paths()
         self._end_beside()
-        if best is None or labels is None:
+        if first is None:
             return
+        best = first.found
+        yield best
         namings: list[_Naming] = []
-        for other in chain([named], self._fitting(best.cost[0], besides=labels)):
-            naming = other if other.control else replace(other, control=self._street_control(other.labels))
-            for found in self._better_streets(naming):
+        for other in chain([first.naming], self._all_with_paths(best.cost[0], besides=first.naming.labels)):
+            naming = other if other.control else replace(other, control=self._path_control(other.labels))
+            for found in self._better_paths(naming):
                 if found.cost < best.cost:
                     best, namings = found, []
                     yield best
@@ -149,42 +168,50 @@ class FramedEngine(SameEngine):
                 namings.append(naming if len(namings) < KEPT else replace(naming, control=None))
         self._best = best.cost, namings
 
-    def _fewest_dstates(self) -> Generator[Found, None, list[int] | None]:
-        """The labels of `_minimal_labels`. Where they take long, maps that are soon found come before."""
-        while True:
-            try:
-                return self._minimal_labels(self._has_news)
-            except TakesLong:
-                if not self._guessed:
-                    self._guessed = True
-                    yield from self._guesses(self._guess or self._streets.guessed_labels(self._chart, self._watch))
-                else:
-                    yield from self._news_beside()
-                    yield from self._bettered()
+    def _first_with_paths(self) -> Generator[Found, None, _Fitted | None]:
+        """The first labels with the fewest dstates that have paths; where they take long, maps that are soon found come before."""
+        while (labels := self._visits.fewest(self._should_interrupt)) is not None:
+            if labels is OPEN:
+                yield from self._maps_found_soon()
+            elif (fitted := self._some_paths(labels)) is not None:
+                return fitted
+            else:
+                self._forbid(labels)
+        return None
 
-    def _has_news(self) -> bool:
+    def _maps_found_soon(self) -> Iterator[Found]:
+        """Maps near a guess, once; and then what came of the search beside this one."""
+        if not self._guessed:
+            self._guessed = True
+            yield from self._near_guess(self._guess or self._paths.guessed_labels(self._chart, self.asker.watch))
+        else:
+            yield from self._maps_found_beside()
+            yield from self._improve_known_map()
+
+    def _should_interrupt(self) -> bool:
         """Whether there is a guess, or it is time for one; or what the search beside found is to be tried, or shows that the known map has fewest dstates."""
         if self._beside:
-            self._heed(self._beside)
+            self._absorb(self._beside)
         if self._guessed:
-            return self._labels_beside() is not None or (self._known is not None and self.bound == len(set(self._known)))
-        if not self._speedups.annealed:
+            known = self._visits.known
+            return self._labels_beside() is not None or (known is not None and self.bound == len(set(known)))
+        if not self._task.speedups.annealed or self._visits.has_forbidden:
             return False
-        waited = self._watch.elapsed()
-        limit = waited + self._watch.left()
+        waited = self.asker.watch.elapsed()
+        limit = waited + self.asker.watch.left()
         soon = min(self._soon, SOON_SHARE * limit) if limit > self._soon else self._soon
-        if not self._beside and waited > soon and self._has_processors():
+        if not self._beside and waited > soon and self._task.has_processors:
             self._search_beside(self._chart)
-        later = self._soon if self._knows_all else min(LATER * self._soon, LATER_SHARE * limit)
+        later = self._soon if self._visits.knows_all else min(LATER * self._soon, LATER_SHARE * limit)
         return self._guess is not None or (not self._beside and waited > max(later, GUESS_FIRST))
 
     def _search_beside(self, chart: FramedChart) -> None:
         """Begin to guess beside this, and to prove from there that the causal axioms need so many dstates."""
-        watch, pinned = Watch(beside=self._watch), self.clique or [0]
+        watch, pinned = Watch(beside=self.asker.watch), self._visits.clique or [0]
         apart = chart.apart(others=pinned)
         self._named = NearbySearch(
             watch,
-            self._speedups,
+            self._task.speedups,
             chart=chart,
             clique=pinned,
             may_be=[(~row).nonzero()[0].tolist() for row in apart],
@@ -195,263 +222,239 @@ class FramedEngine(SameEngine):
 
     def _fewer_labels(self, named: NearbySearch, chart: FramedChart, watch: Watch) -> Iterator[list[int]]:
         """Labels, each time fewer, of maps of the causal axioms near a guess."""
-        guessed_labels = self._streets.guessed_labels
-        self._guess = in_process(guessed_labels, chart, watch=watch) if self._speedups.processes else guessed_labels(chart, watch)
+        guessed_labels = self._paths.guessed_labels
+        self._guess = in_process(guessed_labels, chart, watch=watch) if self._task.speedups.processes else guessed_labels(chart, watch)
         yield from named.fewer(self._guess)
 
     def map_of_guess(self) -> Found | None:
         """A map of the whole trace made of a guess, without a search: None where none is found soon."""
-        try:
-            self._chart = self._charted(len(self._trace))
-        except NoFrame:
-            return None
-        return self._single_streets(self._streets.guessed_labels(self._chart, self._watch))
+        chart = self._charted(len(self._task.trace), None)
+        return None if chart is None else self._separate_paths(self._paths.guessed_labels(chart, self.asker.watch), chart)
 
     def map_mended_from(self, known: Sequence[int]) -> Found | None:
-        """A map of the whole trace in which the first steps keep these dstates, as far as can be, and all else is new, if that has streets."""
-        chart = self._chart = Chart.framed(self._trace, self._log, around=self._around)
+        """A map of the whole trace in which the first steps keep these dstates, as far as can be, and all else is new, if that has paths."""
+        chart = Chart.framed(self._task.trace, self._task.log, around=self._around)
+        if chart is None:
+            return None
         guess = [-1] * len(chart.seen)
         for node, label in zip(chart.node_of, known, strict=False):
             guess[node] = label
-        return self._single_streets(kept(chart.apart(), chart.links, guess))
+        return self._separate_paths(kept(chart.apart(), chart.links, guess), chart)
 
     def _end_beside(self) -> None:
         if self._beside:
             self._beside.end()
-            self._heed(self._beside)
+            self._absorb(self._beside)
             self._beside = None
 
-    def _heed(self, beside: Beside) -> None:
+    def _absorb(self, beside: Beside) -> None:
         """Take what the search beside knows."""
         beside.check()
-        self.bound = max(self.bound or 0, beside.bound)
+        self._visits.bound = max(self._visits.bound or 0, beside.bound)
 
     def settle(self) -> None:
         self._end_beside()
 
-    def _labels_of(self, dstates: int) -> Generator[list[int], None, None]:
+    def _all_labels(self, dstates: int) -> Generator[list[int], None, None]:
+        """All labels with so many dstates."""
         named = self._named_at(dstates)
-        yield from named.listed(self._watch) if named else super()._labels_of(dstates)
+        yield from named.listed(self.asker.watch) if named else self._visits.all_of(dstates)
 
     def _named_at(self, dstates: int) -> NearbySearch | None:
         """What searched beside, if that alone showed that there are no fewer dstates."""
-        return self._named if self._named and self._named.bound == dstates > self._least else None
+        return self._named if self._named and self._named.bound == dstates > self._visits.least else None
 
-    def _guesses(self, guess: Sequence[int]) -> Iterator[Found]:
-        """Maps near a guess, if it leads to any, each with fewer dstates than the one before; and better streets for each."""
+    def _near_guess(self, guess: Sequence[int]) -> Iterator[Found]:
+        """Maps near a guess, if it leads to any, each with fewer dstates than the one before; and better paths for each."""
         failed = 0
-        for labels in self._labels_near(guess):
-            yield from self._bettered()
+        for labels in self._visits.near(guess):
+            yield from self._improve_known_map()
             if labels is None:
-                yield from self._news_beside()
-            elif self._known and len(set(labels)) >= len(set(self._known)):
+                yield from self._maps_found_beside()
+            elif self._visits.known and len(set(labels)) >= len(set(self._visits.known)):
                 break
-            elif not (fits := (yield from self._known_if_it_has_streets(labels))):
+            elif not (fits := (yield from self._known_if_it_has_paths(labels))):
                 failed += 1
                 if fits is None or failed == GUESSES:
                     break
                 self._forbid(labels)
-        yield from self._bettered()
+        yield from self._improve_known_map()
 
-    def _bettered(self) -> Iterator[Found]:
-        """The known map with better streets, unless these were looked for already, or there is no time for that."""
-        if self._known and self._known_cost and len(self._theory.priorities) > 1 and self._watch.allows(self._preparing):
+    def _improve_known_map(self) -> Iterator[Found]:
+        """The known map with better paths, unless these were looked for already, or there is no time for that."""
+        known = self._visits.known
+        if known and self._known_cost and len(self._task.theory.priorities) > 1 and self.asker.watch.allows(self._preparing):
             cost, self._known_cost = self._known_cost, ()
-            yield from (found for found in self._maps(_Naming(list(self._known), None), "opt", GUESSING) if found.cost < cost)
+            yield from (found for found in self._maps(_Naming(list(known), None), "opt", GUESSING) if found.cost < cost)
 
-    def _news_beside(self) -> Iterator[Found]:
+    def _maps_found_beside(self) -> Iterator[Found]:
         """A map of the labels last found beside, if they are new and have streets."""
         if labels := self._labels_beside():
             self._tried = labels
-            yield from self._known_if_it_has_streets(labels)
+            yield from self._known_if_it_has_paths(labels)
 
     def _labels_beside(self) -> list[int] | None:
         """The labels last found beside, if they were not tried yet, and have fewer dstates than the known map."""
-        labels = self._beside.labels if self._beside else None
-        if labels is self._tried or not labels or (self._known and len(set(labels)) >= len(set(self._known))):
+        labels, known = self._beside.labels if self._beside else None, self._visits.known
+        if labels is self._tried or not labels or (known and len(set(labels)) >= len(set(known))):
             return None
         return labels
 
-    def _known_if_it_has_streets(self, labels: Sequence[int]) -> Generator[Found, None, bool | None]:
+    def _known_if_it_has_paths(self, labels: Sequence[int]) -> Generator[Found, None, bool | None]:
         """The map of these labels, from now on the known one, if any streets fit them. Returns whether they do; None if there is no time to see that."""
-        found = self._soon_streets(labels)
-        if found is None:
-            if not self._watch.allows(self._preparing):
+        fitted = self._paths_found_soon(labels)
+        if fitted is None:
+            if not self.asker.watch.allows(self._preparing):
                 return None
-            found, _ = self._all_streets(labels)
-        if found is None:
+            fitted = self._any_paths(labels)
+        if fitted is None:
             return False
-        self._known, self._known_cost = tuple(numbered(labels)), found.cost
-        yield found
+        self._visits.known, self._known_cost = tuple(numbered(labels)), fitted.found.cost
+        yield fitted.found
         return True
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         if not self._framed:
             return
-        namings = self._best[1] if self._best and self._best[0] == cost else self._fitting(cost[0])
+        namings = self._best[1] if self._best and self._best[0] == cost else self._all_with_paths(cost[0])
         mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
         yield from islice((found for naming in namings for found in self._maps(naming, mode)), enough or None)
 
-    def _fitting(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[_Naming]:
-        """All ways to be at so many dstates that have streets, each once, and not that one."""
-        known = {tuple(besides)}
-        while True:
-            refused: list[int] | None = None
-            with closing(self._labels_of(dstates)) as all_labels:
-                for labels in all_labels:
-                    if tuple(labels) in known:
-                        continue
-                    found, naming = self._some_streets(labels)
-                    known.add(tuple(labels))
-                    if found is not None:
-                        yield naming
-                    elif not self._named_at(dstates):
-                        refused = labels
-                        break
-            if refused is None:
-                return
-            self._forbid(refused)
+    def _all_with_paths(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[_Naming]:
+        """All labels with so many dstates that have paths, each once, and not those."""
+        fitted: dict[tuple[int, ...], _Fitted] = {}
 
-    def _some_streets(self, labels: Sequence[int]) -> tuple[Found | None, _Naming]:
-        """A map with these dstates, if any streets fit them."""
-        found = self._soon_streets(labels)
-        return (found, _Naming(list(labels), None)) if found else self._all_streets(labels)
+        def why_not(labels: list[int]) -> list[int] | None:
+            if (found := self._some_paths(labels)) is None:
+                return labels
+            fitted[tuple(labels)] = found
+            return None
 
-    def _soon_streets(self, labels: Sequence[int]) -> Found | None:
+        if self._named_at(dstates):  # what searches beside is not told why labels have no paths; it lists each anyway
+            known = {tuple(besides)}
+            for labels in self._all_labels(dstates):
+                if tuple(labels) not in known and (found := self._some_paths(labels)) is not None:
+                    yield found.naming
+                known.add(tuple(labels))
+            return
+        for labels in all_accepted(lambda: self._all_labels(dstates), why_not, self._forbid, key=tuple, known={tuple(besides)}):
+            yield fitted.pop(tuple(labels)).naming
+
+    def _some_paths(self, labels: Sequence[int]) -> _Fitted | None:
+        """A map with these dstates, if any paths fit them."""
+        return self._paths_found_soon(labels) or self._any_paths(labels)
+
+    def _paths_found_soon(self, labels: Sequence[int]) -> _Fitted | None:
         """A map with these dstates, where they are many and there is one in which no two places or stretches are taken for one."""
-        return self._single_streets(labels) if len(set(labels)) > MANY_DSTATES else None
+        found = self._separate_paths(labels, self._chart) if len(set(labels)) > MANY_DSTATES else None
+        return _Fitted(found, _Naming(list(labels), None)) if found else None
 
-    def _all_streets(self, labels: Sequence[int]) -> tuple[Found | None, _Naming]:
-        """A map with these dstates, if any streets fit them, and a control for all of them."""
-        naming = _Naming(list(labels), self._street_control(labels))
-        return next(self._maps(naming, "ignore"), None), naming
+    def _any_paths(self, labels: Sequence[int]) -> _Fitted | None:
+        """A map with these dstates, if any paths fit them, and a control for all of them."""
+        naming = _Naming(list(labels), self._path_control(labels))
+        found = next(self._maps(naming, "ignore"), None)
+        return _Fitted(found, naming) if found else None
 
-    def _single_streets(self, labels: Sequence[int]) -> Found | None:
+    def _separate_paths(self, labels: Sequence[int], chart: FramedChart) -> Found | None:
         """A map with these dstates in which no two places or stretches are taken for one, unless they have to be; if there is one."""
-        naming = _Naming(list(labels), self._street_control(labels, single=True))
-        return next(self._maps(naming, "ignore"), None)
+        naming = _Naming(list(labels), self._path_control(labels, single=True, chart=chart))
+        return next(self._maps(naming, "ignore", chart=chart), None)
 
-    def _better_streets(self, naming: _Naming) -> Iterator[Found]:
+    def _better_paths(self, naming: _Naming) -> Iterator[Found]:
         """Maps with these dstates, each as good as the one before or better, the last one best; none if no streets fit them.
 
         Where bettering maps does not end soon, the bound is raised from below instead.
         """
-        if len(self._theory.priorities) == 1:
+        if len(self._task.theory.priorities) == 1:
             yield from self._maps(naming, "ignore")
             return
         proven = yield from self._maps(naming, "opt", BETTERING)
         if not proven:
-            control = self._street_control(naming.labels, ["--opt-strategy=usc"])
+            control = self._path_control(naming.labels, ["--opt-strategy=usc"])
             yield from self._maps(replace(naming, control=control), "opt")
 
-    def _maps(self, naming: _Naming, mode: str, conflicts: int = -1) -> Generator[Found, None, bool]:
+    def _maps(self, naming: _Naming, mode: str, conflicts: int = -1, chart: FramedChart | None = None) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
-        control = naming.control or self._street_control(naming.labels)
-        alone = mode == "opt" and len(set(naming.labels)) > MANY_DSTATES and not self._beside and self._has_processors()
+        control = naming.control or self._path_control(naming.labels)
+        alone = mode == "opt" and len(set(naming.labels)) > MANY_DSTATES and not self._beside and self._task.has_processors
         give_threads(control, two=alone)  # which keep all that they list
-        reader = facts.StreetReader(control, self._trace, self._theory, self._chart, naming.labels)
-        answers = self._answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
-        return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), self._theory), answers))
+        reader = facts.StreetReader(control, self._task.trace, self._task.theory, chart or self._chart, naming.labels)
+        answers = self.asker.answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
+        return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), self._task.theory), answers))
 
     @property
     def _preparing(self) -> float:
         """Seconds, about, until clingo can be stopped that is asked for all streets."""
-        return PREPARED * self._street_seconds
+        return PREPARED * self._path_seconds
 
-    def _street_control(
-        self, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None, *, single: bool = False
+    def _path_control(
+        self,
+        labels: Sequence[int],
+        options: Sequence[str] = (),
+        nodes: Iterable[int] | None = None,
+        *,
+        single: bool = False,
+        chart: FramedChart | None = None,
     ) -> clingo.Control:
-        """A control for the streets that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
-        self._watch.check(0.0 if single else self._preparing)
-        began, worked = time.perf_counter(), time.thread_time()
-        control = self._streets.settled(self._chart, labels, options, nodes, single=single)
-        self._watch.check()
+        """A control for the paths that fit the labels of all nodes, or of these; or only for separate ones, none of which is taken for another."""
+        self.asker.watch.check(0.0 if single else self._preparing)
+        worked = time.thread_time()
+        with self.asker.grounding_timed():
+            control = self._paths.settled(chart or self._chart, labels, options, nodes, single=single)
+        self.asker.watch.check()
         seconds = time.thread_time() - worked  # of this thread: the one beside may have made it wait
-        self._street_seconds = (self._street_seconds or ALL_STREETS * len(set(labels)) * seconds) if single else seconds
-        self.ground_seconds += time.perf_counter() - began
+        self._path_seconds = (self._path_seconds or ALL_PATHS * len(set(labels)) * seconds) if single else seconds
         return control
 
     def _forbid(self, labels: Sequence[int]) -> None:
-        """Tell clingo why there are no streets for these labels."""
-        self._refuse(labels)
-        if self._speedups.sides and len(self._fits) <= MANY_PAIRS and self._say_street(labels):
-            return
-        rules = []
-        clashes = self._clashing(labels)
-        if unknown := {self._chart.facing[node][0] for clash in clashes for node in clash} - self._visits:
-            self._give_more(unknown)
-        for clash in clashes:
-            first = {labels[node]: node for node in clash}
-            different = [pair for a, b in combinations(first.values(), 2) if (pair := self._pair(a, b)) in self._fits]
-            if self._fits.issuperset(together := self._spanning(labels, clash)):  # else clingo knows by now
-                rules.append(facts.forbidden_pairs(together, different))
-        self._tell("\n".join(rules))
+        """Tell clingo why there are no paths for these labels."""
+        self._visits.take_back(labels)
+        told = (
+            self._task.speedups.sides
+            and self._visits.pairs <= MANY_PAIRS
+            and self._sides.say_of_path(self._paths, self._chart, labels, self._visits.standing(labels))
+        )
+        if not told:
+            self._visits.forbid(labels, self._clashing(labels))
 
-    def _say_street(self, labels: Sequence[int]) -> bool:
-        """Say what order and sides demand of a street that these labels contradict. False if all such streets have been told of."""
-        control = self._streets.control(self._chart)
-        control.add("base", [], facts.settled_labels(enumerate(labels)))
-        control.ground([("base", []), ("again", []), ("contrary", [])])
-        contrary, twice = next(self._answers(facts.read_contrary, "ignore", 1, control=control))
-        stand = {labels[node]: self._chart.facing[node] for node in self._place_of}
-        if any(self._say_once("street", *stand[dstate]) for dstate in contrary):
-            return True
-        for visit in (stand[dstate][0] for dstate in twice):
-            said = [self._say_once("street", visit, 0), self._say_once("street", visit, 1), self._say_once("crossing", visit, self._batch)]
-            if any(said):
-                return True
-        return False
-
-    def _say_once(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides_framed.lp, unless it was before. Returns whether it was not."""
-        if (part, arguments) in self._said:
+    def forbid(self, equalities: Collection[Equality]) -> bool:
+        if any(equality.of == "place" for equality in equalities):
             return False
-        began = time.perf_counter()
-        batches = range(self._batch + 1)
-        if not self._said:
-            self._control.load(encodings.path("sides_framed"))
-            self._control.add("sides", [], facts.side_facts(self._theory))
-            self._control.ground([("sides", []), *(("streets", facts.numbers(batch)) for batch in batches)])
-        self._said[part, arguments] = None
-        if part == "street":
-            self._control.ground([(part, facts.numbers(*arguments, batch)) for batch in batches])
-        else:
-            self._control.ground([(part, facts.numbers(*arguments))])
-        self.ground_seconds += time.perf_counter() - began
+        self._end_beside()
+        self._best, self._named, self._tried = None, None, None
+        node_of = self._chart.node_of
+        self._visits.forbid_together([(node_of[equality.first], node_of[equality.second]) for equality in equalities])
         return True
 
-    def _begin(self, chart: FramedChart) -> None:
-        super()._begin(chart)
-        self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # parts of sides_framed.lp
-
-    def _give(self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False) -> None:
-        super()._give(chart, visits, order, anew=anew)
-        if self._said:
-            streets = [(part, facts.numbers(*arguments, self._batch)) for part, arguments in self._said if part == "street"]
-            self._control.ground([("streets", facts.numbers(self._batch)), *streets])
-
     def _clashing(self, labels: Sequence[int]) -> list[list[int]]:
-        """Sets of nodes whose labels no streets fit, of none of which a node can be spared: CLASHES of them at most."""
-        control = self._streets.control(self._chart, SMALLEST)
-        control.add("base", [], facts.open_labels(labels))
-        control.ground([("base", [])])
-        clashes = list(self._answers(lambda model: sorted(facts.read_names(model)), "ignore", CLASHES, control=control))
+        """Minimal conflicting sets of nodes: no paths fit the labels of any of these sets. At most CLASHES of them."""
+        control = self._paths.clashing(self._chart, labels)
+        clashes = list(self.asker.answers(lambda model: sorted(facts.read_names(model)), "ignore", CLASHES, control=control))
         return clashes or [self._clash(labels)]
 
     def _clash(self, labels: Sequence[int]) -> list[int]:
-        """One such set, where it takes the choices of paths_framed.lp to see that there are no streets: nodes are left out while there are none."""
+        """One such set, where it takes the choices of paths_framed.lp to see that there are no paths: nodes are left out while there are none."""
 
         def clashing(nodes: list[int]) -> list[int] | None:
-            control = self._street_control(labels, nodes=nodes)
-            return next(self._answers(lambda _: None, "ignore", 1, control=control), nodes)
+            control = self._path_control(labels, nodes=nodes)
+            return next(self.asker.answers(lambda _: None, "ignore", 1, control=control), nodes)
 
         return smaller(list(range(len(labels))), clashing)
 
-    def _charted(self, size: int) -> FramedChart:
-        """The nodes, and which of them are at different places because of what the trace alone says of order and sides."""
-        chart = Chart.framed(self._trace, self._log, size, self._around)
+    @property
+    def _chart(self) -> FramedChart:
+        return self._visits.chart
+
+    def _charted(self, size: int, before: FramedChart | None) -> FramedChart | None:
+        """The nodes of the first steps, and which of them are at different places because of what the trace alone says of order and sides.
+
+        before  the chart of fewer steps: it says of its nodes which are at different places, and nothing more is asked
+        """
+        chart = Chart.framed(self._task.trace, self._task.log, size, self._around)
+        if chart is None or before is not None:
+            return chart and before and chart.with_elsewhere(before.elsewhere)
         nodes = range(len(chart.seen))
-        control = self._streets.telling(chart, nodes, nodes)
-        self._watch.check()
-        _, elsewhere, _ = next(self._answers(facts.read_told, "ignore", 1, control=control))
+        control = self._paths.telling(chart, nodes, nodes)
+        self.asker.watch.check()
+        _, elsewhere, _ = next(self.asker.answers(facts.read_told, "ignore", 1, control=control))
         return chart.with_elsewhere(elsewhere)

@@ -13,9 +13,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from ssh_abduction.asp.limits import Watch
+from ssh_abduction.engines.base import Task
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.steps.chart import Chart, NoFrame
+from ssh_abduction.steps.chart import Chart
 from ssh_abduction.steps.log import Log
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
@@ -34,7 +35,8 @@ def maps_with_frames(trace: Trace, theory: Theory, watch: Watch, speedups: Speed
     if theory.star == "none":
         trace = trace.without_stars()
         around = _around(trace, Log(trace, theory))
-    engine = FramedEngine(trace, framed, watch, Log(trace, framed), speedups.that_hold_for(framed), around, soon=0.0)
+    task = Task.of(trace, framed, watch, speedups)
+    engine = FramedEngine(task, around, soon=0.0)
     try:
         engine.grow(len(trace))
         for found in engine.improving_maps():
@@ -45,7 +47,4 @@ def maps_with_frames(trace: Trace, theory: Theory, watch: Watch, speedups: Speed
 
 def _around(trace: Trace, log: Log) -> Mapping[int, Sequence[int]]:
     """What is seen all around where something is seen ahead; the same everywhere, if turns do not tell."""
-    try:
-        return Chart.around(trace, log, len(trace))
-    except NoFrame:
-        return dict.fromkeys(log.seen, (0, 0, 0, 0))
+    return Chart.around(trace, log, len(trace)) or dict.fromkeys(log.seen, (0, 0, 0, 0))

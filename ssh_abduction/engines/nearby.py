@@ -39,7 +39,7 @@ import numpy as np
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker, give_threads, has_processors, new_control
-from ssh_abduction.asp.limits import Stopped, Watch
+from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.steps.apart import Matrix
 from ssh_abduction.steps.chart import Chart, numbered
 from ssh_abduction.theory.speedups import Speedups
@@ -58,7 +58,7 @@ _Key: TypeAlias = tuple[int, int]  # what is seen at a node, and its label
 _Verdict: TypeAlias = Literal["moved", "needed", "open"]
 
 
-class NearbySearch(Asker):
+class NearbySearch:
     """Maps of the first steps near a guess.
 
     bound  the number of dstates of the last map, once that is proven to be the least
@@ -75,7 +75,8 @@ class NearbySearch(Asker):
         far: Callable[[int], Matrix] | None,
         configuration: str | None = None,
     ) -> None:
-        super().__init__(watch)
+        self.bound: int | None = None
+        self._asker = Asker(watch)
         self._speedups = speedups
         self._chart = chart
         self.clique = list(clique)
@@ -129,12 +130,12 @@ class NearbySearch(Asker):
 
     def listed(self, watch: Watch) -> Iterator[list[int]]:
         """All labels with as few dstates as `bound`, once that is known; the same ones now and then once more."""
-        self._watch = watch
+        self._asker.watch = watch
         assert self.bound is not None
         spares = self.bound - len(self.clique)
         while True:
-            give_threads(self._control, two=has_processors(self._speedups))
-            with closing(self._answers(facts.read_names, f"enum,{spares},{spares}", 0, assumptions=[self._ordered])) as answers:
+            give_threads(self._asker.control, two=has_processors(self._speedups))
+            with closing(self._asker.answers(facts.read_names, f"enum,{spares},{spares}", 0, assumptions=[self._ordered])) as answers:
                 for answer in answers:
                     if resting := self._rests.intersection(answer.values()):
                         break
@@ -157,17 +158,17 @@ class NearbySearch(Asker):
         self._choices = [options if t in pinned else [*options, *self._spare[seen[t]]] for t, options in enumerate(map(list, self._may_be))]
         links = self._chart.links
         base = facts.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
-        self._watch.check(SECONDS_A_CHARACTER * len(base))
-        self._control = new_control("names", base, ["--eq=1"], self._speedups)
+        self._asker.watch.check(SECONDS_A_CHARACTER * len(base))
+        self._asker.control = new_control("names", base, ["--eq=1"], self._speedups)
         if self._configuration:
-            configuration: Any = self._control.configuration
+            configuration: Any = self._asker.control.configuration
             configuration.configuration, configuration.sat_prepro = self._configuration, "no"
         self._used = {name: self._literal(facts.used(name)) for spare in self._spare.values() for name in spare}
         given: set[int] = set()
         last: dict[int, int] = {}  # by view, the last step that has a choice
         self._ordered = self._literal(facts.ordered())
         for batch, start in enumerate(range(0, len(links), AT_A_TIME)):
-            self._watch.check()
+            self._asker.watch.check()
             part, added = f"batch_{batch}", links[start : start + AT_A_TIME]
             new = sorted({end for s, _, x in added for end in (s, x)} - given)
             given.update(new)
@@ -177,12 +178,12 @@ class NearbySearch(Asker):
                 if t not in pinned:
                     last[seen[t]] = t
             far = [(t, int(u)) for t in new for u in np.flatnonzero(self._far(t)[:t])] if self._far is not None else []
-            self._control.add(part, [], facts.batch_facts(batch, nodes, added, far))
-            self._control.ground([(part, []), ("more", facts.numbers(batch))])
-        self._watch.check(PREPARING * (time.perf_counter() - began))
+            self._asker.control.add(part, [], facts.batch_facts(batch, nodes, added, far))
+            self._asker.control.ground([(part, []), ("more", facts.numbers(batch))])
+        self._asker.watch.check(PREPARING * (time.perf_counter() - began))
 
     def _literal(self, symbol: clingo.Symbol) -> int:
-        atom = self._control.symbolic_atoms[symbol]
+        atom = self._asker.control.symbolic_atoms[symbol]
         assert atom is not None
         return atom.literal
 
@@ -197,7 +198,7 @@ class NearbySearch(Asker):
         literals = self._literals()
         while True:
             stay = {literal: name for literal, name in zip(literals, self._labels, strict=True) if literal and name not in free}
-            answer, core = self._verdict(facts.read_names, [-self._ordered, *assumed, *stay], conflicts)
+            answer, core = self._asker.verdict(facts.read_names, [-self._ordered, *assumed, *stay], conflicts)
             if answer is not None:
                 self._keep(answer)
                 return "moved"
@@ -326,7 +327,7 @@ class NearbySearch(Asker):
         cost = len(set(self._labels)) - 1 - len(self.clique)
         if cost < 0:
             return None, []
-        return self._verdict(facts.read_names, assumed, conflicts, f"enum,{cost},{cost}")
+        return self._asker.verdict(facts.read_names, assumed, conflicts, f"enum,{cost},{cost}")
 
     def _name_more(self, resting: Collection[int]) -> None:
         """Take a control with more names for the views of these rests."""
@@ -395,7 +396,7 @@ class Beside:
             for labels in found:
                 self.labels = labels
             self.bound = search.bound or 0
-        except Stopped:
+        except LimitError:
             pass
         except BaseException as error:
             self._error = error

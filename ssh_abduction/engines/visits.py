@@ -26,25 +26,23 @@ of a guess. They need not have the fewest dstates. But where they have as few as
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from itertools import islice
-from typing import Self, TypeAlias, TypeVar
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from functools import partial
+from itertools import combinations, islice
+from typing import Final, Protocol, TypeAlias, TypeVar
 
 import clingo
 import numpy as np
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.control import new_control
-from ssh_abduction.asp.limits import Watch
-from ssh_abduction.engines.base import ChartedEngine
+from ssh_abduction.asp.control import Asker, new_control
+from ssh_abduction.engines.base import Task
+from ssh_abduction.engines.refusing import first_accepted
 from ssh_abduction.steps.apart import clique
-from ssh_abduction.steps.chart import Chart, FramedChart, numbered
+from ssh_abduction.steps.chart import FramedChart, numbered
 from ssh_abduction.steps.localising import Located, State, faced, located, states_of
-from ssh_abduction.steps.log import Log
-from ssh_abduction.theory.speedups import Speedups
-from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 SECONDS_A_PAIR = 3e-5  # what clingo takes, about, to ground two visits that may be one: it cannot be stopped meanwhile
 FIRST_PAIRS = 10_000  # visits that may be one, of which clingo is told at first
@@ -61,101 +59,152 @@ Member = TypeVar("Member")
 _Turned: TypeAlias = dict[int, dict[int, int]]  # of visits that are the same: which slot of the other slot 0 is
 
 
-class TakesLong(Exception):  # noqa: N818 - not an error
-    """Clingo has not found the fewest dstates yet, and something else is to be done first."""
+class Open(Enum):
+    """Stands for an answer that is not known yet, as something else is to be done first."""
+
+    OPEN = "open"
 
 
-class SameEngine(ChartedEngine):
-    """Which visits are one, so that dstates are fewest.
+OPEN: Final = Open.OPEN
 
-    around  as in Chart.framed, where steps have no stars
+
+@dataclass
+class _Answer:
+    """The pairs of visits that are one, and, once they are known to be transitive, where all visits are; or that the answer is not known yet."""
+
+    pairs: Sequence[Pair] = ()
+    everywhere: Located | None = None
+    is_open: bool = False
+
+
+@dataclass(frozen=True)
+class _Reason:
+    """Why an answer is none: threes of visits that it is not transitive on, or else visits that it does not say the places of."""
+
+    threes: Sequence[Three]
+    missed: Collection[int]
+
+
+class Sides(Protocol):
+    """What tells clingo of order and sides, along with visits (`engines/sides.py`)."""
+
+    def begin(self) -> None:
+        """The control is a new one, which knows nothing."""
+        ...
+
+    def extend(self, batch: int) -> None:
+        """Clingo was told of more visits, in this batch."""
+        ...
+
+
+class VisitLabels:
+    """Labels of the nodes of the first steps with the fewest dstates, by which visits are at one place.
+
+    bound   no labels have fewer dstates
+    clique  nodes that are pairwise apart
+    known   labels of a map, if one is known; set by who finds one near a guess
+    chart   of the first `size` steps
+    has_forbidden  whether evidence forbade something that was found out of a map
+    least   how many dstates clingo itself has shown to be needed
+    batch   the number of the last visits that clingo was told of in one go
     """
 
-    _chart: FramedChart
-    _known: tuple[int, ...] | None  # labels of a map; set by who finds one near a guess
+    chart: FramedChart
 
-    def __init__(
-        self, trace: Trace, theory: Theory, watch: Watch, log: Log, speedups: Speedups, around: Mapping[int, Sequence[int]] | None = None
-    ) -> None:
-        super().__init__(trace, theory, watch, log, speedups)
-        self._around = around
+    def __init__(self, task: Task, asker: Asker, charted: Callable[[int, FramedChart | None], FramedChart | None], sides: Sides) -> None:
+        """Labels of no steps yet.
 
-    def over(self, trace: Trace, watch: Watch, log: Log) -> Self:
-        self._trace, self._watch, self._log = trace, watch, log
-        self.ground_seconds = self.solve_seconds = 0.0
-        return self
+        charted  makes the chart of so many first steps, from one of fewer steps if there is one; None where they fit no frame
+        sides    is told of new controls and of batches
+        """
+        self.bound: int | None = None
+        self.clique: list[int] = []
+        self.known: tuple[int, ...] | None = None
+        self.has_forbidden = False
+        self.size = 0
+        self.batch = -1
+        self.least = 0
+        self._task, self._asker, self._charted, self._sides = task, asker, charted, sides
 
-    def _charted(self, size: int) -> FramedChart:
-        """The nodes and visits of the first steps."""
-        raise NotImplementedError
+    def work_on(self, task: Task) -> None:
+        """Go on with a trace that the one before has grown to."""
+        self._task = task
 
-    def grow(self, size: int) -> None:
-        """Chart the first steps, and tell clingo what is new of their visits; in a new control if that is much."""
+    def grow(self, size: int) -> bool:
+        """Chart the first steps, and tell clingo what is new of their visits; in a new control if that is much. False where visits fit no frame."""
         if size == self.size:
-            return
-        began = time.perf_counter()
-        grown = self.size > 0
-        if grown:
-            chart = Chart.framed(self._trace, self._log, size, self._around).with_elsewhere(self._chart.elsewhere)
-            grown = len(chart.seen) <= GROWN * self._first_nodes
-        if grown:
-            new = range(len(self._chart.stars), len(chart.stars)) if self._knows_all else ()
-            self._give(chart, {*self._visits, *new}, range(len(chart.seen)))
-        else:
-            chart = self._charted(size)
-            apart = chart.apart()
-            self._watch.check()
-            self.clique = clique(apart, chart.seen) if self._speedups.clique else []
-            order = [*self.clique, *sorted(set(range(len(apart))) - set(self.clique), key=lambda node: (-int(apart[node].sum()), node))]
-            self._give(chart, self._first_visits(chart), order, anew=True)
-        self.size = size
-        self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
-        self._known = None
-        self.ground_seconds += time.perf_counter() - began
+            return True
+        with self._asker.grounding_timed():
+            grown = self._charted(size, self.chart) if self.size else None
+            if grown is not None and len(grown.seen) <= GROWN * self._first_nodes:
+                new = range(len(self.chart.stars), len(grown.stars)) if self.knows_all else ()
+                self._give(grown, {*self._visits, *new}, range(len(grown.seen)))
+            else:
+                chart = self._charted(size, None)
+                if chart is None:
+                    return False
+                self._give(chart, self._first_visits(chart), self._order_of_choice(chart), anew=True)
+            self.size = size
+            self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
+            self.known = None
+            return True
+
+    def _order_of_choice(self, chart: FramedChart) -> list[int]:
+        """The nodes, those first that are pairwise apart, then those that fit few others."""
+        apart = chart.apart()
+        self._asker.watch.check()
+        self.clique = clique(apart, chart.seen) if self._task.speedups.clique else []
+        return [*self.clique, *sorted(set(range(len(apart))) - set(self.clique), key=lambda node: (-int(apart[node].sum()), node))]
 
     def _first_visits(self, chart: FramedChart) -> set[int]:
         """The visits that clingo is told of first: all, unless too many may be one."""
-        first = chart.visits_with(FIRST_PAIRS) if self._speedups.lazy else len(chart.stars)
+        first = chart.visits_with(FIRST_PAIRS) if self._task.speedups.lazy else len(chart.stars)
         return {*range(first), *(chart.facing[node][0] for node in self.clique)}
 
     @property
-    def _knows_all(self) -> bool:
+    def knows_all(self) -> bool:
         """Whether clingo was told of all visits."""
-        return len(self._visits) == len(self._chart.stars)
+        return len(self._visits) == len(self.chart.stars)
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs of visits may be one, of those that clingo knows."""
+        return len(self._fits)
 
     def _begin(self, chart: FramedChart) -> None:
         """Take a control that knows nothing, for visits of a chart."""
         self._first_nodes = len(chart.seen)
-        self._control = new_control("visits", "", ["--heuristic=Domain"], self._speedups)
-        self._batch = -1
+        self._asker.control = new_control("visits", "", ["--heuristic=Domain"], self._task.speedups)
+        self.batch = -1
         self._visits: set[int] = set()  # that clingo knows, and of these
         self._place_of: dict[int, int] = {}  # where nodes are in the order of choice
         self._ends: set[int] = set()  # visits of which it knows how they end
         self._turns: set[tuple[int, str, int]] = set()
         self._fits: frozenset[Pair] = frozenset()
-        self._least = 0
+        self.least = 0
         self._avoided: dict[int, clingo.Symbol] = {}  # what is assumed not to be there, by the literal of that
         self._pair_of = _PairOf()
         self._unread: list[Pair] = []  # whose literals were not asked for yet
         self._transitive = _Transitive()
-        self._control.register_propagator(self._transitive)
+        self._asker.control.register_propagator(self._transitive)
         self._core_sizes: list[int] = []
         self._parts = 0
+        self._sides.begin()
 
     def _give(self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False) -> None:
         """Tell clingo what it does not know yet of these visits of a chart. New nodes come after the others in the order of choice."""
         told = sorted(visits)
         known = 0 if anew else len(self._fits)
-        self._watch.check(SECONDS_A_PAIR * (int(chart.fitting[-1]) - known) if len(told) == len(chart.stars) else 0.0)
+        self._asker.watch.check(SECONDS_A_PAIR * (int(chart.fitting[-1]) - known) if len(told) == len(chart.stars) else 0.0)
         fits = frozenset(chart.fits(told))
-        self._watch.check(SECONDS_A_PAIR * (len(fits) - known))
+        self._asker.watch.check(SECONDS_A_PAIR * (len(fits) - known))
         size, self.size = self.size, 0  # until clingo was told all of it
         if anew:
             self._begin(chart)
         else:
-            self._control.release_external(facts.listed(self._batch))
-        self._chart = chart
-        self._batch += 1
+            self._asker.control.release_external(facts.listed(self.batch))
+        self.chart = chart
+        self.batch += 1
         added = sorted(visits - self._visits)
         self._visits |= visits
         nodes = []
@@ -167,89 +216,99 @@ class SameEngine(ChartedEngine):
             (visit, *how) for visit, how in chart.leaves.items() if visit in visits and visit + 1 in visits and visit not in self._ends
         ]
         self._ends.update(visit for visit, *_ in leaves)
-        turns = [turn for turn in chart.turns(self._trace) if turn not in self._turns and chart.facing[turn[0]][0] in visits]
+        turns = [turn for turn in chart.turns(self._task.trace) if turn not in self._turns and chart.facing[turn[0]][0] in visits]
         self._turns.update(turns)
         new, unfit = sorted(fits - self._fits), sorted(self._fits - fits)
         self._fits = fits
-        part = f"visits_{self._batch}"
-        self._control.add(part, [], facts.visit_facts(self._batch, nodes, leaves, new, unfit))
-        self._control.add(part, [], facts.turn_facts(self._batch, chart, added, turns))
-        self._control.ground([(part, []), ("more", facts.numbers(self._batch))])
-        self._control.assign_external(facts.listed(self._batch), True)
-        atoms = self._control.symbolic_atoms
+        part = f"visits_{self.batch}"
+        self._asker.control.add(part, [], facts.visit_facts(self.batch, nodes, leaves, new, unfit))
+        self._asker.control.add(part, [], facts.turn_facts(self.batch, chart, added, turns))
+        self._asker.control.ground([(part, []), ("more", facts.numbers(self.batch))])
+        self._asker.control.assign_external(facts.listed(self.batch), True)
+        atoms = self._asker.control.symbolic_atoms
         for place, *_ in nodes:
             atom = atoms[facts.alone(place)]
-            if atom and (atom.is_fact or not self._speedups.core_guided):
-                self._least += atom.is_fact
+            if atom and (atom.is_fact or not self._task.speedups.core_guided):
+                self.least += atom.is_fact
             elif atom:
                 self._avoided[-atom.literal] = atom.symbol
         self._raise_bound()
         self._unread += new
         self._excluded = 0  # so many of the labels found clingo will not find again
+        self._sides.extend(self.batch)
         self.size = size
 
     def _give_more(self, visits: Iterable[int]) -> None:
         """Tell clingo of these visits, too."""
-        began = time.perf_counter()
         more = {*self._visits, *visits}
         assert more != self._visits  # else that would go on without end
-        self._give(self._chart, more, range(len(self._chart.seen)))
-        self.ground_seconds += time.perf_counter() - began
+        with self._asker.grounding_timed():
+            self._give(self.chart, more, range(len(self.chart.seen)))
 
     def _raise_bound(self) -> None:
-        self.bound = max(self.bound or 0, self._least)
+        self.bound = max(self.bound or 0, self.least)
 
-    def _minimal_labels(self, until: Callable[[], bool] = lambda: False) -> list[int] | None:
-        """Dstates of all nodes, as few as can be; None where clingo was told more than any can satisfy. Raises TakesLong where `until` holds."""
+    def fewest(self, until: Callable[[], bool] = lambda: False) -> list[int] | Open | None:
+        """Labels of all nodes with the fewest dstates; None where clingo was told more than any can satisfy; OPEN where `until` holds before that is known."""
         while not self._found:
-            if self._known and self.bound == len(set(self._known)):
-                self._found.append(self._known)
+            if self.known and self.bound == len(set(self.known)):
+                self._found.append(self.known)
                 break
-            pairs = self._fewest(until)
-            if pairs is None:
+            answer = first_accepted(partial(self._best_answer, until), self._why_not, self._tell_why)
+            if answer is None:
                 return None
-            if labels := self._settled(pairs):
-                self._found.append(labels)
+            if answer.is_open:
+                return OPEN
+            self._found.append(self._labels_by(answer))
         return list(self._found[0])
 
-    def _settled(self, pairs: Sequence[Pair]) -> tuple[int, ...] | None:
-        """The dstate of each node in an answer; None if that is not transitive, or does not say where all visits are, and clingo is told so."""
-        if threes := self._intransitive(pairs):
-            self._close(threes)
+    def _why_not(self, answer: _Answer) -> _Reason | None:
+        """Why an answer is none: it is not transitive, or does not say where all visits are."""
+        if answer.is_open:
             return None
-        everywhere = self._located(pairs)
-        if everywhere.missed:
-            self._give_more(everywhere.missed)
-            return None
-        return self._labels(everywhere)
+        threes = self._intransitive(answer.pairs)
+        if not threes:
+            answer.everywhere = self._located(answer.pairs)
+        missed = answer.everywhere.missed if answer.everywhere else ()
+        return _Reason(threes, missed) if threes or missed else None
 
-    def _fewest(self, until: Callable[[], bool]) -> list[Pair] | None:
+    def _tell_why(self, reason: _Reason) -> None:
+        """Tell clingo what an answer did not hold."""
+        if reason.threes:
+            self._close(reason.threes)
+        else:
+            self._give_more(reason.missed)
+
+    def _labels_by(self, answer: _Answer) -> tuple[int, ...]:
+        """The labels by an answer that nothing speaks against."""
+        assert answer.everywhere is not None
+        return self._labels(answer.everywhere)
+
+    def _best_answer(self, until: Callable[[], bool]) -> _Answer | None:
         """An answer with the fewest lone nodes."""
-        if not self._speedups.core_guided:
-            better = list(self._answers(lambda model: (self._pairs(model), model.cost[0]), "opt", 0))
+        if not self._task.speedups.core_guided:
+            better = list(self._asker.answers(lambda model: (self._pairs(model), model.cost[0]), "opt", 0))
             if not better:
                 return None
-            pairs, self._least = better[-1]
+            pairs, self.least = better[-1]
             self._raise_bound()
-            return pairs
+            return _Answer(pairs)
         while True:
             if until():
-                raise TakesLong
-            answer, core = self._verdict(self._pairs, list(self._avoided), until=until)
+                return _Answer(is_open=True)
+            pairs_found, core = self._asker.verdict(self._pairs, list(self._avoided), until=until)
             if core is None:
-                if answer is None:
-                    raise TakesLong
-                return answer
+                return _Answer(pairs_found or (), is_open=pairs_found is None)
             if not core:
                 return None
-            self._relax(self._smaller(core) if self._speedups.small_cores else core)
+            self._relax(self._smaller(core) if self._task.speedups.small_cores else core)
 
     def _pairs(self, model: clingo.Model) -> list[Pair]:
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
 
     def _read_literals(self) -> None:
         """Look up the literals that two visits are one: that takes seconds where there are many, and is seldom needed."""
-        atoms = self._control.symbolic_atoms
+        atoms = self._asker.control.symbolic_atoms
         for pair in self._unread:
             if atom := atoms[facts.same(pair)]:
                 self._transitive.literals[pair] = atom.literal
@@ -257,12 +316,12 @@ class SameEngine(ChartedEngine):
 
     def _smaller(self, core: list[int]) -> list[int]:
         """A core of fewer members, as long as that is cheap."""
-        return smaller(core, lambda part: self._verdict(lambda _: None, part, TRY_CONFLICTS)[1], FAILED_TRIES)
+        return smaller(core, lambda part: self._asker.verdict(lambda _: None, part, TRY_CONFLICTS)[1], FAILED_TRIES)
 
     def _relax(self, core: Sequence[int]) -> None:
         """As not all members of a core can be avoided, ask only that no two of them are there."""
         members = [self._avoided.pop(literal) for literal in core]
-        self._least += 1
+        self.least += 1
         self._raise_bound()
         for member in members:
             if (over := facts.read_over(member)) is not None:
@@ -276,40 +335,40 @@ class SameEngine(ChartedEngine):
     def _limit(self, core: int, count: int) -> None:
         """Ask that fewer than so many members of a core are there."""
         if count <= self._core_sizes[core]:
-            self._control.ground([("over", facts.numbers(core, count))])
-            if atom := self._control.symbolic_atoms[facts.over(core, count)]:
+            self._asker.control.ground([("over", facts.numbers(core, count))])
+            if atom := self._asker.control.symbolic_atoms[facts.over(core, count)]:
                 self._avoided[-atom.literal] = atom.symbol
 
     def _tell(self, told: str, part: str | None = None, number: int = 0) -> None:
         """Tell clingo more. No limit stops this: a core whose members are no longer avoided has to get its limit."""
-        began = time.perf_counter()
-        name = f"told_{self._parts}"
-        self._parts += 1
-        self._control.add(name, [], told)
-        self._control.ground([(name, [])])
-        if part is not None:
-            self._control.ground([(part, facts.numbers(number))])
-        self.ground_seconds += time.perf_counter() - began
+        with self._asker.grounding_timed():
+            name = f"told_{self._parts}"
+            self._parts += 1
+            self._asker.control.add(name, [], told)
+            self._asker.control.ground([(name, [])])
+            if part is not None:
+                self._asker.control.ground([(part, facts.numbers(number))])
 
     def _close(self, threes: Iterable[Three]) -> None:
         """Tell clingo that to be the same is transitive, of these visits."""
         self._tell(facts.three_facts(self._parts, threes), "closed", self._parts)
 
-    def _labels_near(self, guess: Sequence[int]) -> Iterator[tuple[int, ...] | None]:
-        """Labels of all nodes near those of a map: that first, then others, where visits of a place of its are one. None now and then.
+    def near(self, guess: Sequence[int]) -> Iterator[tuple[int, ...] | None]:
+        """First the guess itself, then improved labels of all nodes; yields None between queries so that the caller can do other work.
 
-        First no others are one where that can be, until these are labels of a map that is taken for `known`. Then clingo is asked for no
-        lone nodes; of those that a core shows to be too many, one is left alone. Visits of places that cannot all be as guessed are let free.
+        Clingo is asked for labels in which visits that the guess has at one place are at one place. At first no other visits are, as far as
+        that can be, until the caller takes such labels for `known`. Then it is asked for no lone nodes; of those that a core shows to be too
+        many, one is left alone. Visits of places that cannot all be as guessed are let free.
         """
         yield tuple(numbered(guess))
-        states = states_of(self._chart, guess)
+        states = states_of(self.chart, guess)
         place_of: dict[int, int] = {}  # by the literal that two of its visits are one
         freed: set[int] = set()
         avoided: set[int] = set()
         patient, pairs, batch = False, 0, -1
         while True:
-            if batch < self._batch:
-                batch = self._batch
+            if batch < self.batch:
+                batch = self.batch
                 self._read_literals()
                 for (i, j, r), literal in islice(self._transitive.literals.items(), pairs, None):
                     if states[i] // 4 != states[j] // 4 or (states[i] - states[j]) % 4 != r:
@@ -318,10 +377,10 @@ class SameEngine(ChartedEngine):
                         place_of[literal] = states[i] // 4
                 pairs = len(self._transitive.literals)
                 patient = False
-            if self._known and not patient:
+            if self.known and not patient:
                 patient, avoided = True, set(self._avoided)
             yield None
-            answer, core = self._verdict(self._pairs, [*place_of, *avoided])
+            pairs_found, core = self._asker.verdict(self._pairs, [*place_of, *avoided])
             if core is not None:
                 if fewer := [literal for literal in core if literal in avoided]:
                     avoided.difference_update(fewer[-1:] if patient else fewer)
@@ -330,31 +389,33 @@ class SameEngine(ChartedEngine):
                     place_of = {literal: place for literal, place in place_of.items() if place not in freed}
                 else:
                     return
-            elif labels := self._settled(answer or ()):
-                yield labels
+            elif (reason := self._why_not(answer := _Answer(pairs_found or []))) is not None:
+                self._tell_why(reason)
+            else:
+                yield self._labels_by(answer)
 
     def _together_impossible(self, places: list[int], place_of: Mapping[int, int]) -> list[int]:
         """Of places that cannot all be as guessed, few that cannot."""
 
         def impossible(some: list[int]) -> list[int] | None:
-            core = self._verdict(lambda _: None, [literal for literal, place in place_of.items() if place in some], TRY_CONFLICTS)[1]
+            core = self._asker.verdict(lambda _: None, [literal for literal, place in place_of.items() if place in some], TRY_CONFLICTS)[1]
             return None if core is None else sorted({place_of[literal] for literal in core})
 
         return smaller(places, impossible, FAILED_TRIES)
 
-    def _labels_of(self, dstates: int) -> Generator[list[int], None, None]:
+    def all_of(self, dstates: int) -> Generator[list[int], None, None]:
         """All ways to be at so many dstates, each once.
 
         Each is asked for as the fewest dstates were, once clingo is told not to find again what was found: so it is soon seen that there
         is no other. Where there are many, the next one is near, and a propagator keeps answers transitive (`_nearby`).
         """
-        if self._minimal_labels() is None or self._least > dstates:
+        if self.fewest() is None or self.least > dstates:
             return
         yield from map(list, self._found)
         asked = 0
         while True:
             known = [self._spanning(found, self._place_of) for found in self._found[self._excluded :]]
-            self._tell("\n".join(facts.forbidden_pairs(pairs, listed=self._batch) for pairs in known))
+            self._tell("\n".join(facts.forbidden_pairs(pairs, listed=self.batch) for pairs in known))
             self._excluded = len(self._found)
             labels = self._other(dstates)
             if labels is None:
@@ -378,7 +439,7 @@ class SameEngine(ChartedEngine):
         self._read_literals()
         self._transitive.asked, self._transitive.failed = True, 0
         mode, assumed = self._asking_for(dstates)
-        answers = self._answers(read, mode, 0, assumptions=assumed, until=lambda: self._transitive.failed > FAR)
+        answers = self._asker.answers(read, mode, 0, assumptions=assumed, until=lambda: self._transitive.failed > FAR)
         try:
             while True:
                 try:
@@ -398,26 +459,61 @@ class SameEngine(ChartedEngine):
         return False
 
     def _other(self, dstates: int) -> tuple[int, ...] | None:
-        """An answer of so many dstates that was not excluded."""
-        while True:
+        """Labels with so many dstates that were not excluded."""
+
+        def ask() -> _Answer | None:
             mode, assumed = self._asking_for(dstates)
-            pairs, _ = self._verdict(self._pairs, assumed, mode=mode)
-            if pairs is None:
-                return None
-            if labels := self._settled(pairs):
-                return labels
+            found, _ = self._asker.verdict(self._pairs, assumed, mode=mode)
+            return None if found is None else _Answer(found)
+
+        answer = first_accepted(ask, self._why_not, self._tell_why)
+        return None if answer is None else self._labels_by(answer)
 
     def _asking_for(self, dstates: int) -> tuple[str, list[int]]:
         """How clingo is asked for so many dstates, at most, and what is assumed."""
-        if self._speedups.core_guided and self._least == dstates:
+        if self._task.speedups.core_guided and self.least == dstates:
             return "ignore", list(self._avoided)
         return f"enum,{dstates}", []
 
-    def _refuse(self, labels: Sequence[int]) -> None:
-        """Take back labels that turned out to be no answer."""
+    def take_back(self, labels: Sequence[int]) -> None:
+        """Labels that were given turned out to be no answer."""
         if (refused := tuple(labels)) in self._found:
             self._excluded -= self._found.index(refused) < self._excluded
             self._found.remove(refused)
+
+    def forbid(self, labels: Sequence[int], clashes: Collection[Collection[int]]) -> None:
+        """From now on the nodes of none of these sets are at the dstates that these labels give them, those of one label at one and the others not."""
+        if unknown := {self.chart.facing[node][0] for clash in clashes for node in clash} - self._visits:
+            self._give_more(unknown)
+        rules = []
+        for clash in clashes:
+            first = {labels[node]: node for node in clash}
+            different = [pair for a, b in combinations(first.values(), 2) if (pair := self._pair(a, b)) in self._fits]
+            if self._fits.issuperset(together := self._spanning(labels, clash)):  # else clingo knows by now
+                rules.append(facts.forbidden_pairs(together, different))
+        self._tell("\n".join(rules))
+
+    def forbid_together(self, pairs: Collection[tuple[int, int]]) -> None:
+        """From now on these pairs of nodes are not all one dstate."""
+        self.has_forbidden = True
+        facing = self.chart.facing
+        apart = [(a, b) for a, b in pairs if a != b]
+        if unknown := {facing[node][0] for pair in apart for node in pair} - self._visits:
+            self._give_more(unknown)
+        together = [self._pair(a, b) for a, b in apart]
+        if self._fits.issuperset(together):
+            self._tell(facts.forbidden_pairs(together))
+
+        def is_left(labels: Sequence[int]) -> bool:
+            return any(labels[a] != labels[b] for a, b in apart)
+
+        self._excluded = sum(map(is_left, self._found[: self._excluded]))
+        self._found = [labels for labels in self._found if is_left(labels)]
+        self.known = self.known if self.known and is_left(self.known) else None
+
+    def standing(self, labels: Sequence[int]) -> dict[int, tuple[int, int]]:
+        """The visit and slot of some node at each dstate, as far as clingo knows of any."""
+        return {labels[node]: self.chart.facing[node] for node in self._place_of}
 
     def _spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
         """Pairs that are the same if these nodes are at the dstates that they are labelled with."""
@@ -426,15 +522,15 @@ class SameEngine(ChartedEngine):
 
     def _pair(self, a: int, b: int) -> Pair:
         """How the visits of two nodes are turned where these are at one dstate."""
-        (i, s), (j, t) = sorted((self._chart.facing[a], self._chart.facing[b]))
+        (i, s), (j, t) = sorted((self.chart.facing[a], self.chart.facing[b]))
         return i, j, (t - s) % 4
 
     def _intransitive(self, pairs: Sequence[Pair]) -> list[Three]:
         """Visits of which an answer, with what follows from it, does not hold that to be the same is transitive."""
         found: dict[Three, None] = {}
         turned: _Turned = {}
-        leaves = self._chart.leaves
-        work = _scattered(pairs, len(self._chart.stars))
+        leaves = self.chart.leaves
+        work = _scattered(pairs, len(self.chart.stars))
         if not work:
             return []
         for pair in pairs:
@@ -462,11 +558,11 @@ class SameEngine(ChartedEngine):
         for visit in sorted(self._visits):
             i, r = first.get(visit, (visit, 0))
             states[visit] = 4 * number.setdefault(i, len(number)) + -r % 4
-        return located(self._chart, states)
+        return located(self.chart, states)
 
     def _labels(self, everywhere: Located) -> tuple[int, ...]:
         """The dstate of each node, numbered by the first node there."""
-        return tuple(numbered(faced(everywhere.states[visit], slot) for visit, slot in self._chart.facing))
+        return tuple(numbered(faced(everywhere.states[visit], slot) for visit, slot in self.chart.facing))
 
 
 def smaller(members: list[Member], shrunk: Callable[[list[Member]], list[Member] | None], tries: int | None = None) -> list[Member]:

@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 
 from ssh_abduction.asp.control import has_processors
-from ssh_abduction.asp.limits import Stopped, Watch
+from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.asp.process import in_process
+from ssh_abduction.engines.base import Task
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.steps.log import Log
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Step, Trace
@@ -25,14 +25,14 @@ from ssh_abduction.trace import Step, Trace
 
 def guessed_map(trace: Trace, theory: Theory, speedups: Speedups, watch: Watch) -> SSHMap | None:
     """A map made of a guess, if one is found soon."""
-    found = FramedEngine(trace, theory, watch, Log(trace, theory), speedups.that_hold_for(theory)).map_of_guess()
+    found = FramedEngine(Task.of(trace, theory, watch, speedups)).map_of_guess()
     return found.map if found else None
 
 
 def mended_map(trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None) -> SSHMap | None:
     """A map of a trace near one of its first steps that its later steps contradict, if there is one in which all that does not fit is new."""
     watch = watch or Watch()
-    found = FramedEngine(trace, theory, watch, Log(trace, theory), speedups.that_hold_for(theory)).map_mended_from(known.labels)
+    found = FramedEngine(Task.of(trace, theory, watch, speedups)).map_mended_from(known.labels)
     return found.map if found else None
 
 
@@ -73,7 +73,7 @@ def _make(
         if known and len(steps) > len(known.labels):
             known = in_process(mended_map, Trace(tuple(steps)), theory, known, speedups, watch=watch)
         found.set_result(known)
-    except Stopped:
+    except LimitError:
         found.set_result(None)
     except BaseException as error:
         found.set_exception(error)

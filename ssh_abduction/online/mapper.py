@@ -280,7 +280,7 @@ class OnlineMapper:
             theory=self.theory,
             steps=len(self._steps),
             prefix=self._search.prefix,
-            evidence=last.evidence,
+            basis=last.basis,
             seconds=Seconds(time.perf_counter() - began, last.seconds.ground if asked else 0.0, last.seconds.solve if asked else 0.0),
             stopped=None if self._complete else self._search.stopped,
         )

@@ -10,8 +10,9 @@ import random
 import time
 
 from ssh_abduction.errors import SolverError
-from ssh_abduction.judge.checker import Violation, check
+from ssh_abduction.judge.checker import Violation, check, unchecked
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.theory.evidence import Equality, evidence_of
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
@@ -37,10 +38,19 @@ class Judging:
     def __init__(self, trace: Trace, theory: Theory) -> None:
         self._trace = trace
         self._theory = theory
+        self._evidence = evidence_of(theory)
         self._judged = 0
         self._seconds = 0.0  # spent so far
         self._a_step = 0.0  # seconds that a step takes, by the last check
         self._shown = not UNSHOWN & theory.given_up
+
+    def why_refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
+        """Equalities of a map, of the trace or a prefix, that some evidence finds out cannot all hold; None where it refuses none."""
+        return next((found for evidence in self._evidence if (found := evidence.refuse(self._trace, ssh_map))), None)
+
+    def accepts(self, ssh_map: SSHMap) -> bool:
+        """Whether a map of the whole trace that nothing proves yet is known to satisfy all axioms."""
+        return not unchecked(self._theory) and not check(self._trace, ssh_map, self._theory) and not self.why_refused(ssh_map)
 
     def pass_map(self, ssh_map: SSHMap, prefix: int, elapsed: float) -> None:
         """Raise InternalError where a map of the whole trace breaks an axiom, as far as there is time to look.

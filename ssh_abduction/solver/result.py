@@ -8,7 +8,7 @@ from enum import Enum
 from ssh_abduction.asp.limits import Stop
 from ssh_abduction.engines.base import Cost
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.steps.certificate import Certificate, Evidence
+from ssh_abduction.steps.certificate import Basis, Certificate
 from ssh_abduction.steps.noise import LEAST, Noise
 from ssh_abduction.theory.theory import Theory
 
@@ -74,7 +74,7 @@ class Solution:
     steps      length of the trace
     prefix     how many of its first steps had to be given to clingo
     stopped    why the search ended before it was complete, else None
-    evidence   what the certificate is made from; None where the theory is without an axiom that this rests on
+    basis      what the certificate is made from; None where the theory is without an axiom that this rests on
     partial    where no map of the whole trace was found: the best map of its first steps
     """
 
@@ -87,14 +87,14 @@ class Solution:
     steps: int
     prefix: int
     seconds: Seconds
-    evidence: Evidence | None = field(default=None, repr=False)
+    basis: Basis | None = field(default=None, repr=False)
     stopped: Stop | None = None
     partial: SSHMap | None = None
 
     @property
     def certificate(self) -> Certificate | None:
-        """Why no map has fewer dstates. Worked out when it is first asked for; None where there is no evidence."""
-        return self.evidence.certificate if self.evidence else None
+        """Why no map has fewer dstates. Worked out when it is first asked for; None where there is nothing that it could be made from."""
+        return self.basis.certificate if self.basis else None
 
     @property
     def noise(self) -> Noise | None:
@@ -103,7 +103,7 @@ class Solution:
         Worked out when it is first asked for.
         """
         few = self.cost is not None and self.cost.dstates <= LEAST
-        return None if few or self.status is Status.UNSATISFIABLE or self.evidence is None else self.evidence.noise
+        return None if few or self.status is Status.UNSATISFIABLE or self.basis is None else self.basis.noise
 
     @property
     def count(self) -> int:

@@ -59,7 +59,7 @@ class Certificate:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Basis:
     """What a certificate is made of, once somebody asks for it: to make it takes as long as to solve a short trace.
 
     views    what was seen at the first steps of the trace, as numbers

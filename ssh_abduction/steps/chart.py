@@ -36,10 +36,6 @@ Link: TypeAlias = tuple[int, int, int]  # node, action, node
 QUARTERS: dict[TurnDirection | None, int] = {"right": 1, "around": 2, "left": 3}
 
 
-class NoFrame(Exception):  # noqa: N818 - not an error
-    """Some visit does not fit a frame: the theory has no map of the trace."""
-
-
 @dataclass(frozen=True)
 class Chart:
     """Nodes, numbered by the first step at them, and links.
@@ -87,32 +83,37 @@ class Chart:
         )
 
     @staticmethod
-    def turned(trace: Trace, log: Log, size: int) -> FramedChart:
+    def turned(trace: Trace, log: Log, size: int) -> FramedChart | None:
         """The chart of the first steps, as if places had frames. What is seen ahead, right, back and left takes the place of stars.
 
-        This is a guess, as the causal theory does not say that turns rotate. Raises NoFrame where some action is neither turn nor travel, or where
+        This is a guess, as the causal theory does not say that turns rotate. None where some action is neither turn nor travel, or where
         what is seen after a turn does not follow from what was seen before.
         """
-        return Chart.framed(trace, log, size, Chart.around(trace, log, size))
+        around = Chart.around(trace, log, size)
+        return None if around is None else Chart.framed(trace, log, size, around)
 
     @staticmethod
-    def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]]:
-        """For each observation, what is seen ahead, right, back and left of where it is seen ahead, as turns show. Raises NoFrame as `turned` does."""
-        after: dict[
-            tuple[int, int], int
-        ] = {}  # by an observation and an amount to turn by, in quarters to the right: what is seen after the turn
+    def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]] | None:
+        """For each observation, what is seen ahead, right, back and left of where it is seen ahead, as turns show. None as `turned` says."""
+        after: dict[tuple[int, int], int] = {}  # what is seen after a turn, by what was seen before it and the quarters to the right
         for action, before, then in zip(trace.actions[: size - 1], log.seen, log.seen[1:], strict=False):
             if action.kind is None:
-                raise NoFrame
+                return None
             if action.turn:
                 quarters = QUARTERS[action.turn]
                 if after.setdefault((before, quarters), then) != then or after.setdefault((then, 4 - quarters), before) != before:
-                    raise NoFrame
-        return {seen: _views_around(seen, after) for seen in dict.fromkeys(log.seen[:size])}
+                    return None
+        found: dict[int, list[int]] = {}
+        for seen in dict.fromkeys(log.seen[:size]):
+            views = _views_around(seen, after)
+            if views is None:
+                return None
+            found[seen] = views
+        return found
 
     @staticmethod
-    def framed(trace: Trace, log: Log, size: int | None = None, around: Mapping[int, Sequence[int]] | None = None) -> FramedChart:
-        """The chart of the first steps (default all), where places have frames. Raises NoFrame.
+    def framed(trace: Trace, log: Log, size: int | None = None, around: Mapping[int, Sequence[int]] | None = None) -> FramedChart | None:
+        """The chart of the first steps (default all), where places have frames. None where some visit fits no frame: then there is no map.
 
         around  in the place of stars: for each observation, what is seen ahead, right, back and left of where it is seen ahead
         """
@@ -135,7 +136,7 @@ class Chart:
             if (here := node.setdefault((visit, slot), len(seen))) == len(seen):
                 seen.append(log.seen[t])
             if seen[here] != log.seen[t] or stars[visit] != star:
-                raise NoFrame
+                return None
             node_of.append(here)
             if t and action.kind == "travel":
                 travels.append((node_of[-2], log.actions[t - 1], here))
@@ -147,7 +148,7 @@ class Chart:
         away = {(node_of[i], node_of[j]) for i, j in _pairs_within(log.pairs.elsewhere, size)}
         excluded = {(node_of[i], node_of[j]) for i, j in _pairs_within(log.pairs.apart, size)} - away
         if any(i == j for i, j in excluded) or any(facing[i][0] == facing[j][0] for i, j in away):
-            raise NoFrame
+            return None
         return FramedChart(
             tuple(seen),
             tuple(links),
@@ -311,8 +312,8 @@ def numbered(labels: Iterable[Hashable]) -> list[int]:
     return [number.setdefault(label, len(number)) for label in labels]
 
 
-def _views_around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int]:
-    """What is seen ahead, right, back and left of where this is seen ahead. Raises NoFrame where turns do not tell, or contradict each other.
+def _views_around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int] | None:
+    """What is seen ahead, right, back and left of where this is seen ahead. None where turns do not tell, or contradict each other.
 
     after  what is seen after a turn, by what was seen before it and by how many quarters to the right it turned
     """
@@ -327,7 +328,5 @@ def _views_around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int]:
             if there not in views:
                 waiting.append(there)
             if views.setdefault(there, then) != then:
-                raise NoFrame
-    if len(views) < 4:
-        raise NoFrame
-    return [views[slot] for slot in range(4)]
+                return None
+    return [views[slot] for slot in range(4)] if len(views) == 4 else None

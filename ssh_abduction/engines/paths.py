@@ -41,6 +41,8 @@ from ssh_abduction.steps.localising import faced, states_of, tracked
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
+# clasp's way to list answers in which no atom that is shown can be spared:
+SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 FIRST_PAIRS = 200_000  # visits that may be one, of the beginning that is guessed first, where a trace has more than twice as many
 LOST = 0.05  # of all visits, at most, if the beginning says where they are
 TRYING = 500  # conflicts after which it is left open whether there are single streets
@@ -52,7 +54,7 @@ PREPARING = (
 LOOSENED = 2  # so many travels, less one, from where a guess cannot be right its places are let free
 
 
-class Streets:
+class Paths:
     """The axioms of places and paths, for charts of one trace.
 
     pinned  whether stretches no two of which can be one path are named as paths beforehand
@@ -65,18 +67,32 @@ class Streets:
         self._pinned = pinned
         self._check = check
 
-    def __reduce__(self) -> tuple[Callable[..., Streets], tuple[Trace, Theory]]:
-        return partial(Streets, pinned=self._pinned), (self._trace, self._theory)
+    def __reduce__(self) -> tuple[Callable[..., Paths], tuple[Trace, Theory]]:
+        return partial(Paths, pinned=self._pinned), (self._trace, self._theory)
 
-    def _under(self, check: Callable[[], None]) -> Streets:
+    def _under(self, check: Callable[[], None]) -> Paths:
         """The same questions, which these limits end."""
-        return Streets(self._trace, self._theory, pinned=self._pinned, check=check)
+        return Paths(self._trace, self._theory, pinned=self._pinned, check=check)
 
     def control(self, chart: FramedChart, options: Sequence[str] = ()) -> Control:
         """A control with these axioms, and what happened; nothing is grounded yet."""
         control = Control(options, self._check, PREPARING)
         control.load_encodings("paths_framed")
         control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
+        return control
+
+    def contrary(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:
+        """A control that says which single paths these labels contradict."""
+        control = self.control(chart)
+        control.add("base", [], facts.settled_labels(enumerate(labels)))
+        control.ground([("base", []), ("again", []), ("contrary", [])])
+        return control
+
+    def clashing(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:
+        """A control whose answers are the minimal sets of nodes whose labels no paths fit, as far as that takes no choice of paths."""
+        control = self.control(chart, SMALLEST)
+        control.add("base", [], facts.open_labels(labels))
+        control.ground([("base", [])])
         return control
 
     def settled(
@@ -174,12 +190,12 @@ class Streets:
         apart  which nodes are apart, nodes x nodes
         check  called now and then; may raise
         """
-        tell = partial(self._told_if_single, chart)
+        tell = partial(self._told_if_separate, chart)
         likely = self._likely(chart, apart, start, check)
         labels = merged_as_told(apart, chart.links, likely, tell, partial(self.may_fit, chart), check) if likely else None
         return labels if labels and self.has_single(chart, labels) else None
 
-    def _told_if_single(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
+    def _told_if_separate(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
         """As `told`; None where the others have no streets either, as far as single ones tell."""
         told = self.told(chart, labels, loose)
         return told if told and self._may_have_single(chart, labels, loose) else None

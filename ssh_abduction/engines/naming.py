@@ -1,0 +1,668 @@
+"""An engine for the causal theory on long traces: the dstates have names before clingo is asked.
+
+As many steps as are pairwise apart (`steps/apart.py`) are pinned to names of their own. That bounds the number of dstates from below,
+leaves no two ways to name these dstates, and lets every other step choose only among the names that it is not apart from. A view has a few
+spare names, at the cost of one dstate each, and a *rest*, which stands for all dstates of the view beyond them. There may be several
+largest cliques; the one that is pinned has steps that are apart from most others, so that the other steps have the fewest names left.
+
+*Claim.* A map of minimal cost that uses no rest is a minimal map, and its cost is the minimum.
+*Proof.* Name the dstates of any map: those of the pinned steps as pinned, the others by spare names of their view as far as these
+reach, then by the rest. This keeps every rule of names.lp, as a rest asks nothing of the steps at it, and costs at most as many spare
+names as the map has dstates beyond the clique. So the cost found is a lower bound; a map without a rest is a map of the trace, and
+reaches it. ∎ A minimal answer that does use a rest is asked for again, with one more spare name for its view.
+
+Not every step is needed. The control starts with the links of the pinned steps; an answer is followed along the trace, and the links
+at which it fails are added, until one holds everywhere. That is a relaxation until then, so its bounds hold. Where clingo does not
+answer soon, what is missing is rather more knowledge than less, and all links are given at once. With the steps clingo is told which pairs
+of them are apart, where more than one action shows it: no two of these are at one name. The links say so, too, but only once it is
+chosen where they lead.
+
+clasp raises the bound core by core: a core is a set of spare names that cannot all be left unused. Cores are small at first, as the names
+of a view are its own: what different corners of the world need adds up. Raising the bound by cores stalls when what is missing can be
+spread over many views: every core is then about all of them. After CORES conflicts the numbers of dstates are asked for one by one instead,
+from the bound up: is there an answer that costs no more? If there is none, the bound is one higher. The first answer without a rest is a
+minimal map, as it costs what the bound is; the same search then goes on with the other maps.
+
+Of a long trace, whose steps are too many to be compared in pairs, as many are taken as it takes for the clique to be as large as that of all; and what
+conflicts ask for is given a thousand links at a time.
+
+Beside all that small maps are sought in a thread of its own. First steps are merged by evidence (`guesses/merging.py`), so that a limit
+leaves a map that is not bad; then a map is guessed, of places with frames where the trace lets itself be taken for one of these
+(`guesses/annealing.py`), and smaller ones are sought near it (`engines/nearby.py`). Of a long trace the beginning is guessed, and what
+comes of that followed along the rest (`guesses/continuing.py`). Whatever bound meets these maps ends the search. Where there is but one
+processor, steps are merged at once, and the guess waits until raising the bound by cores has stalled. Where there is no such search, clasp
+has the second processor: two threads, which tell each other what they learn. Which minimal maps come first may then differ from run to run;
+all of them are the same.
+
+To read an answer takes Python longer than clingo takes to find it. So an answer is asked only for the atoms that it may hold: where actions
+lead, from which the step after each step follows. While a map is made of one answer, clingo searches for the next.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
+from itertools import chain, islice
+from typing import Any, Protocol, TypeAlias
+
+import clingo
+import numpy as np
+
+from ssh_abduction.asp import facts
+from ssh_abduction.asp.control import Asker, give_threads, new_control
+from ssh_abduction.asp.limits import POLL, LimitError, Watch
+from ssh_abduction.engines.base import AT_ONCE, Task
+from ssh_abduction.engines.nearby import AT_A_TIME, SECONDS_A_CHARACTER, Beside, NearbySearch, mended
+from ssh_abduction.engines.refusing import first_accepted
+from ssh_abduction.guesses.annealing import annealed, annealed_steps
+from ssh_abduction.guesses.continuing import followed
+from ssh_abduction.guesses.merging import merged, merged_near, thinned
+from ssh_abduction.steps.apart import Continuations, Matrix
+from ssh_abduction.steps.chart import Chart, Link, numbered
+
+HELD_BACK = 100  # maps that are kept until all links are given; then they stream
+PREPARING = 0.6  # of the time that grounding took, clingo takes before it begins to solve, and can be stopped
+SPARES = 2  # spare names of a view, to begin with
+PATIENCE = 2000  # conflicts after which more links are given
+MORE_LINKS = 1000  # of a long trace, that clingo is given then; of others all
+CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
+GUESSES = 10  # that are waited for until one is a map, where the robot does not turn
+GUESSED = 24_000  # steps that are guessed in one go, at most
+WHOLE = 100_000  # steps that are taken at once, at most, if more of them are apart then
+TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside that
+
+
+_Trail: TypeAlias = "tuple[Link, _Trail] | None"
+
+
+class Fitting(Protocol):
+    """What asks more of labels than the causal theory does (`engines/frameless.py`)."""
+
+    def why_not(self, labels: Sequence[int]) -> Sequence[int] | None:
+        """Labels that are not those of a map, though each action leads to one dstate; None where they are."""
+        ...
+
+    def forbid(self, labels: Sequence[int]) -> None:
+        """Tell clingo why these labels are not those of a map."""
+        ...
+
+    def tell_again(self) -> None:
+        """The control is a new one: tell it what the one before was told."""
+        ...
+
+
+def _ever_fewer(found: Iterable[list[int]], known: list[int] | None = None) -> Iterator[list[int]]:
+    """Those labels that are fewer than all before them."""
+    for labels in found:
+        if known is None or len(set(labels)) < len(set(known)):
+            known = labels
+            yield labels
+
+
+def _may_be(chart: Chart, clique: Sequence[int]) -> list[list[int]]:
+    """Of each step, those of the clique, by number, that it is not apart from."""
+    apart = np.stack([chart.continuations.apart_from(step) for step in clique], axis=1)
+    return [(~row).nonzero()[0].tolist() for row in apart]
+
+
+class NamedLabels:
+    """Labels of the first steps of a trace with the fewest dstates, which have names.
+
+    bound    no labels have fewer dstates
+    clique   nodes that are pairwise apart, which have names of their own
+    known    labels of a map, if one is known
+    fitting  what asks more of labels; None in the causal theory
+    """
+
+    def __init__(self, task: Task, asker: Asker, given_map: Sequence[int] = (), fitting: Fitting | None = None) -> None:
+        """Labels of no steps yet.
+
+        given_map  labels of all steps of a map with few dstates, if one is known
+        """
+        self.bound: int | None = None
+        self.clique: list[int] = []
+        self.known: list[int] | None = None
+        self.size = 0
+        self._task, self._asker, self._given_map, self._fitting = task, asker, given_map, fitting
+        self._hard = self._one_by_one = False  # whether few conflicts were not enough, and whether raising the bound by cores stalled
+        self._beside: Beside | None = None  # a search for a map near a guess, in another thread
+        self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
+        self._forbidden: list[list[tuple[int, int]]] = []  # sets of pairs of steps, of each of which some pair is not one dstate
+
+    def large_enough(self, size: int) -> int:
+        """Of a long trace, so many steps that more of them would not have a larger clique; at least these."""
+        most = min(len(self._task.trace), WHOLE)
+        if AT_ONCE <= size < most and self._task.speedups.clique:
+            largest = self._clique_size(most)
+            while size < most and self._clique_size(size) < largest:
+                size = min(2 * size, most)
+        return size
+
+    def _clique_size(self, steps: int) -> int:
+        log = self._task.log
+        return len(Continuations(log.seen[:steps], log.actions[: steps - 1]).clique())
+
+    def grow(self, size: int) -> None:
+        """Let there be so many steps."""
+        if size == self.size:
+            return
+        try:
+            self._take(size)
+        except BaseException:
+            self.size = 0  # nothing of this prefix is to be taken for granted
+            raise
+
+    def _take(self, size: int) -> None:
+        """Chart the first steps, pin a clique of their nodes, and take a control for them."""
+        self.size = size
+        with self._asker.grounding_timed():
+            self._chart_steps(size)
+        self._restart()
+
+    def _chart_steps(self, size: int) -> None:
+        """Chart the first steps, and choose what clingo is given of them first."""
+        self.chart = Chart.of_steps(self._task.log, size)
+        self.clique = self.chart.continuations.clique() if self._task.speedups.clique else [0]
+        self._asker.watch.check()
+        self._may_be = _may_be(self.chart, self.clique)
+        self._one_by_one = self._hard = False
+        self.known = numbered(self._given_map[:size]) or None
+        self._spares = self._first_spares()
+        self._links = dict.fromkeys(self.chart.links)
+        if self._task.speedups.lazy:
+            first = {0, *self.clique}
+            self._links = dict.fromkeys(link for link in self.chart.links if link[0] in first)
+        self.bound = max(self.bound or 0, len(self.clique))
+
+    def _first_spares(self) -> dict[int, int]:
+        """How many spare names each view has, to begin with: as many as the given map needs, or a few."""
+        seen = self.chart.seen
+        found = Counter(dict(zip(self._given_map, seen, strict=False)).values())
+        pinned = Counter(seen[node] for node in self.clique)
+        return {view: max(SPARES, found[view] - pinned[view] + 1) if self._given_map else SPARES for view in dict.fromkeys(seen)}
+
+    def _far(self, node: int) -> Matrix:
+        """Which nodes are apart from this one, as more than one action shows, or as evidence says."""
+        continuations = self.chart.continuations
+        return continuations.apart_from(node, actions=2) if self._task.speedups.apart else continuations.excluded_from(node)
+
+    @property
+    def _tells_far(self) -> bool:
+        """Whether clingo is told which nodes are apart."""
+        return self._task.speedups.apart or bool(self.chart.excluded)
+
+    def improving(self) -> Iterator[list[int]]:
+        """Labels of all nodes, the last ones with the fewest dstates; before, if that takes its time, some that have few."""
+        if not self.chart.links:
+            yield [0]
+            return
+        try:
+            for labels in self._searched():
+                if self._is_allowed(labels):
+                    self.known = labels
+                    yield labels
+        except (LimitError, KeyboardInterrupt) as end:
+            self._end_beside()
+            if self.known:
+                yield self.known
+            if isinstance(end, KeyboardInterrupt) or not self._is_settled():
+                raise
+        finally:
+            self._end_beside()
+
+    def _searched(self) -> Iterator[list[int]]:
+        """The same, by the search here; it ends early where the one beside it has the fewest dstates."""
+        while not self._one_by_one:
+            lazy = not self.has_all_links
+            answer, proven = self._cheapest(PATIENCE if lazy else CORES if self._task.speedups.one_by_one else -1)
+            if not proven or answer is None:
+                if not self._hard:
+                    self._hard = True
+                    yield from self._search_nearby()
+                if not lazy and not self._task.has_processors:
+                    yield from self._search_alone()
+                if self._is_settled():
+                    self._end_beside()
+                    yield self.known or []
+                    return
+                if not lazy:
+                    self._ask_one_by_one()
+                    continue
+                self.add(self._more_links())
+                self._configure()
+            elif not self._named_more(answer):
+                self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
+                labels, failed = self._follow(answer)
+                if failed:
+                    self.add(failed)
+                elif (reason := self._why_not(labels)) is None:
+                    yield labels
+                    return
+                else:
+                    self._forbid(reason)
+        fewest = first_accepted(self._first_labels_of_bound, self._why_not, self._forbid)
+        if fewest is None:
+            self._end_beside()
+        yield fewest or self.known or []
+
+    def _cheapest(self, conflicts: int) -> tuple[dict[int, int] | None, bool]:
+        """The best answer that clingo finds with so many conflicts, and whether it is proven to be the best."""
+        answer = None
+        answers = self._asker.answers(facts.read_names, "opt", 0, conflicts=conflicts, on_bound=self._raise_bound, until=self._is_settled)
+        while True:
+            try:
+                answer = next(answers)
+            except StopIteration as end:
+                return answer, bool(end.value)
+
+    def _why_not(self, labels: Sequence[int]) -> Sequence[int] | None:
+        return self._fitting.why_not(labels) if self._fitting else None
+
+    def _forbid(self, labels: Sequence[int]) -> None:
+        assert self._fitting is not None
+        self._fitting.forbid(labels)
+
+    def _is_allowed(self, labels: Sequence[int]) -> bool:
+        """Whether labels keep what evidence says of pairs of steps. That each action leads to one dstate by them is known."""
+        if any(all(labels[i] == labels[j] for i, j in pairs) for pairs in self._forbidden):
+            return False
+        return not self.chart.excluded or self.chart.is_map(labels)
+
+    def forbid_together(self, pairs: Collection[tuple[int, int]]) -> None:
+        """From now on these pairs of steps are not all one dstate."""
+        self._forbidden.append(list(pairs))
+        if self.known and not self._is_allowed(self.known):
+            self.known = None
+        self._tell_forbidden(len(self._forbidden) - 1)
+
+    def _tell_forbidden(self, number: int) -> None:
+        """Tell clingo that these pairs are not all one dstate; and of their steps, if it does not know them."""
+        pairs = self._forbidden[number]
+        steps = {step for pair in pairs for step in pair}
+        self.add_links_at(steps)
+        self.tell(f"not_together_{number}", facts.not_together(number, pairs))
+
+    def add_links_at(self, steps: Collection[int]) -> None:
+        """Give clingo the links to and from these steps, and so the steps, where it does not know them."""
+        self.add(link for link in self.chart.links if link not in self._links and not {link[0], link[2]}.isdisjoint(steps))
+
+    def tell(self, part: str, rules: str) -> None:
+        """Give clingo rules in a program part of this name."""
+        self.end_begun()
+        self._asker.control.add(part, [], rules)
+        self._asker.control.ground([(part, [])])
+
+    def _search_nearby(self) -> Iterator[list[int]]:
+        """Begin to search for small maps in another thread; where there is but one processor, give a map merged by evidence."""
+        if self._fitting or not (self._task.speedups.greedy or self._task.speedups.annealed):
+            return  # what fits the causal theory need not fit one that asks for more
+        if self._task.has_processors:
+            watch = Watch(beside=self._asker.watch)
+            search = self._nearby(watch)
+            near = chain(self._merged(watch.check), self._near_guess(search, watch.check))
+            self._beside = Beside(search, watch, _ever_fewer(self._from_beginning(watch.check) if self._is_long else near))
+        elif not self._is_long:
+            yield from self._merged(self._asker.watch.check)
+
+    def _search_alone(self) -> Iterator[list[int]]:
+        """Search for small maps near a guess for a while, with nothing beside it."""
+        if self._fitting:
+            return
+        if self._is_long:
+            yield from _ever_fewer(self._from_beginning(self._asker.watch.check), self.known)
+            return
+        search = self._nearby(self._asker.watch)
+        yield from _ever_fewer(self._near_guess(search, self._asker.watch.check, TRIES), self.known)
+        self._absorb(None, search.bound or 0)
+
+    def _nearby(self, watch: Watch) -> NearbySearch:
+        return NearbySearch(
+            watch,
+            self._task.speedups,
+            chart=self.chart,
+            clique=self.clique,
+            may_be=self._may_be,
+            far=self._far if self._tells_far else None,
+            configuration="tweety",
+        )
+
+    def _merged(self, check: Callable[[], None]) -> Iterator[list[int]]:
+        """Labels of a map merged by evidence."""
+        if self._task.speedups.greedy:
+            yield merged(self.chart.apart(), self.chart.links, self.clique, check)
+
+    @property
+    def _is_long(self) -> bool:
+        """Whether there are too many nodes to compare them in pairs."""
+        return len(self.chart.seen) > AT_ONCE
+
+    def _from_beginning(self, check: Callable[[], None]) -> Iterator[list[int]]:
+        """Labels of maps of a long trace that guesses at its beginning lead to, ever longer ones, until one needs no dstates beyond those that the guess has."""
+        steps, most = AT_ONCE, len(self.chart.seen) if len(self.chart.seen) <= GUESSED else 2 * AT_ONCE
+        while self._task.speedups.annealed:
+            beginning = Chart.of_steps(self._task.log, steps)
+            clique = beginning.continuations.clique()
+            near = self._map_of_guess(beginning, clique, _may_be(beginning, clique), check)
+            for known in () if near is None else (thinned(beginning, near, check), near):
+                if labels := followed(self._task.log, known, check):
+                    yield labels[: self.size]
+                    yield (labels := thinned(self.chart, labels[: self.size], check))
+                    if len(set(labels)) <= len(set(known)):
+                        return
+            if steps == most:
+                return
+            steps = min(2 * steps, most)
+
+    def _near_guess(self, search: NearbySearch, check: Callable[[], None], tries: int | None = None) -> Iterator[list[int]]:
+        """Labels of a map that is guessed, and of those near that."""
+        near = self._map_of_guess(self.chart, self.clique, self._may_be, check) if self._task.speedups.annealed else None
+        if near is not None:
+            yield from search.fewer(thinned(self.chart, near, check), tries)
+
+    def _map_of_guess(
+        self, steps: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None]
+    ) -> list[int] | None:
+        """Labels of a map of these first steps near a guess; None where none is made."""
+        guess = self._guessed(steps, clique, may_be, check)
+        return None if guess is None else merged_near(steps.apart(), steps.links, guess, check)
+
+    def _guessed(self, steps: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None]) -> list[int] | None:
+        """A guess at the dstates of these first steps, -1 where it is not sure; None where that would take too much memory."""
+        chart = Chart.turned(self._task.trace, self._task.log, len(steps.seen))
+        if chart is None:
+            guesses: Iterable[list[int]] = islice(annealed_steps(steps, clique, may_be, check), GUESSES)
+        else:
+            labels = annealed(chart, check).labels(chart)
+            guesses = [[labels[node] for node in chart.node_of]]
+        guess = None
+        for labels in guesses:
+            guess = mended(labels, steps)
+            if steps.is_map(guess):
+                break
+        return guess
+
+    def _is_settled(self) -> bool:
+        """Whether a map is known that has as few dstates as the bound, also by the search beside this one."""
+        if self._beside is not None:
+            self._beside.check()
+            self._absorb(self._beside.labels, self._beside.bound)
+        return self.known is not None and len(set(self.known)) <= (self.bound or 0)
+
+    def _check_ahead(self, seconds: float) -> None:
+        """Raise LimitError where no time is left for so many seconds of what cannot be interrupted; but first let the search beside this one use it."""
+        if not self._asker.watch.allows(seconds):
+            while self._beside is not None and self._beside.running and not self._is_settled():
+                self._asker.watch.check()
+                time.sleep(POLL)
+        self._asker.watch.check(seconds)
+
+    def _end_beside(self) -> None:
+        if self._beside is not None:
+            self._beside.end()
+            self._absorb(self._beside.labels, self._beside.bound)
+            self._beside = None
+
+    def _absorb(self, labels: list[int] | None, bound: int) -> None:
+        """Take what a search near a guess knows, which knows nothing of pairs of steps that evidence speaks of."""
+        fewer = labels is not None and (self.known is None or len(set(labels)) < len(set(self.known)))
+        if labels is not None and fewer and self._is_allowed(labels):
+            self.known = labels
+        self.bound = max(self.bound or 0, bound)
+
+    def names(self) -> dict[tuple[int, int], int]:
+        """The names of dstates, but for rests, by what stays the same when there are more spare names: the view, and a number."""
+        pinned = {(-1, name): name for name in range(len(self.clique))}
+        return pinned | {(view, i): name for view, spare in self._spare.items() for i, name in enumerate(spare[:-1])}
+
+    def _ask_one_by_one(self) -> None:
+        self._one_by_one = True
+        self._configure()
+
+    def _configure(self) -> None:
+        """Let clasp search as suits what is asked, and how hard it turned out to be."""
+        configuration: Any = self._asker.control.configuration
+        if self._one_by_one:
+            configuration.configuration, configuration.sat_prepro = "crafty", "no"
+        if self._hard and not (self._beside and self._beside.running) and self._task.has_processors:
+            give_threads(self._asker.control, two=True)
+
+    def _first_labels_of_bound(self) -> list[int] | None:
+        """The labels of `_first_of_bound`."""
+        answer = self._first_of_bound()
+        return None if answer is None else self._follow(answer)[0]
+
+    def _first_of_bound(self) -> dict[int, int] | None:
+        """Raise the bound until there is an answer that costs no more. All links are given. None where the search beside this one ended that."""
+        self.end_begun()
+        while True:
+            spares = (self.bound or 0) - len(self.clique)
+            answers = self._asker.answers(self._reader().read, f"enum,{spares},{spares}", 0, until=self._is_settled, ahead=True)
+            answer = next(answers, None)
+            if answer is None and self._is_settled():
+                return None
+            if answer is None:
+                self._raise_bound([spares + 1])
+            elif self._rests(answer):
+                answers.close()
+                self._named_more(answer)
+            else:
+                self._begun = answers
+                self._first = answer
+                return answer
+
+    def _all_of_bound(self, spares: int) -> Iterator[dict[int, int]]:
+        """All answers of this cost that use no rest, where a search for them has begun from there on."""
+        if self._begun is None:
+            read = self._reader().read if self.has_all_links else facts.read_names
+            yield from self._asker.answers(read, f"enum,{spares},0", 0, assumptions=[self._resting(False)], ahead=True)
+            return
+        begun, self._begun = self._begun, None
+        yield self._first
+        yield from (answer for answer in begun if not self._rests(answer))
+
+    def _reader(self) -> facts.NameReader:
+        return facts.NameReader(self._task.log.actions[: self.size - 1], self._choices, self._rest)
+
+    @property
+    def has_all_links(self) -> bool:
+        """Whether clingo was given all links."""
+        return len(self._links) == len(self.chart.links)
+
+    def settle(self) -> None:
+        """End what is still under way in clingo, here and beside this."""
+        self.end_begun()
+        self._end_beside()
+
+    def end_begun(self) -> None:
+        """End the search that goes on after an answer, before clingo is told more."""
+        if self._begun is not None:
+            self._begun.close()
+            self._begun = None
+
+    def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
+        """All ways to name the nodes with so many dstates; or `enough` of them, unless that is 0. One that is known comes first."""
+        known = self.known if self.known and len(set(self.known)) == dstates else None
+        if known:
+            yield known
+        if not known or enough != 1:
+            first = numbered(known or ())
+            yield from (labels for labels in self._listed(dstates, enough) if numbered(labels) != first)
+
+    def _listed(self, dstates: int, enough: int) -> Iterator[list[int]]:
+        """The same, as clingo lists them."""
+        spares = dstates - len(self.clique)
+        if spares < 0:
+            return
+        if not self.chart.links:
+            yield [0]
+            return
+        if not enough or self.bound != dstates:
+            self.end_begun()
+        while True:
+            while not enough and self._needs_rest(spares):  # asked again when nodes were added, as these may be at a rest
+                pass
+            held: list[list[int]] = []
+            failed: Iterable[Link] = ()
+            lazy = not self.has_all_links
+            try:
+                for answer in self._all_of_bound(spares):
+                    labels, failed = self._follow(answer)
+                    if failed:
+                        break
+                    held.append(labels)
+                    if enough:
+                        if len(held) == enough:
+                            yield from held
+                            return
+                    elif not lazy:
+                        yield held.pop()
+                    elif len(held) == HELD_BACK:
+                        failed = self.chart.links
+                        break
+            except LimitError:
+                yield from held  # they cost what the bound is, and fit all links
+                raise
+            if failed:
+                self.add(failed)
+            elif not enough or not self._needs_rest(spares):
+                yield from held
+                return
+
+    def _needs_rest(self, spares: int) -> bool:
+        """Take more spare names, if some answer of this cost uses a rest. Says whether it was so."""
+        answer = next(self._asker.answers(facts.read_names, f"enum,{spares},{spares}", 1, assumptions=[self._resting(True)]), None)
+        return answer is not None and self._named_more(answer)
+
+    def _resting(self, value: bool) -> tuple[clingo.Symbol, bool]:
+        """The assumption that some node is at a rest, or that none is."""
+        return facts.resting(self._batches - 1), value
+
+    def _raise_bound(self, costs: Sequence[int]) -> None:
+        self.bound = max(self.bound or 0, len(self.clique) + costs[0])
+
+    def _restart(self) -> None:
+        """Take a new control, for other names."""
+        self._asker.watch.check()
+        with self._asker.grounding_timed():
+            self._take_control()
+        links, self._links = self._links, {}
+        self.add(links)
+        for number in range(len(self._forbidden)):
+            self._tell_forbidden(number)
+        if self._fitting:
+            self._fitting.tell_again()
+
+    def _take_control(self) -> None:
+        """Take a control that knows the names, and no step yet."""
+        self.end_begun()
+        seen = self.chart.seen
+        names = [(name, seen[node]) for name, node in enumerate(self.clique)]
+        spares = self._spare = dict[int, list[int]]()
+        for view, count in self._spares.items():
+            spares[view] = list(range(len(names), len(names) + count + 1))
+            names += [(name, view) for name in spares[view]]
+        self._rest = {found[-1]: view for view, found in spares.items()}
+        self._choices = [
+            options if len(options) == 1 and t == self.clique[options[0]] else options + spares[seen[t]]
+            for t, options in enumerate(self._may_be)
+        ]
+        cores = ["--opt-strategy=usc"] if self._task.speedups.core_guided else []
+        base = facts.name_facts(names, spares.values(), self.chart.links, self._choices)
+        self._check_ahead(SECONDS_A_CHARACTER * len(base))
+        self._asker.control = new_control("names", base, ["--eq=1", *cores], self._task.speedups)
+        self._configure()
+        self._given: set[int] = set()  # nodes
+        self._open = np.zeros(len(seen), dtype=bool)  # whether a node is one of them, and not pinned
+        self._last: dict[int, int] = {}  # by view, the step given last
+        self._batches = 0
+
+    def add(self, links: Iterable[Link]) -> None:
+        """Give clingo more links, and the nodes at their ends: some at a time, as it cannot be stopped meanwhile."""
+        added, before = list(links), self._asker.ground_seconds
+        for start in range(0, len(added), AT_A_TIME):
+            self._asker.watch.check()
+            with self._asker.grounding_timed():
+                self._give(added[start : start + AT_A_TIME])
+        self._check_ahead(PREPARING * (self._asker.ground_seconds - before))
+
+    def _more_links(self) -> list[Link]:
+        """Links that clingo does not know yet: all of them, or of a long trace those whose ends have the fewest names to choose from."""
+        left = [link for link in self.chart.links if link not in self._links]
+        if not self._is_long:
+            return left
+        return sorted(left, key=lambda link: len(self._choices[link[0]]) * len(self._choices[link[2]]))[:MORE_LINKS]
+
+    def _give(self, links: Iterable[Link]) -> None:
+        added = [link for link in links if link not in self._links]
+        given: list[tuple[int, int, Sequence[int], int | None]] = []
+        far: list[tuple[int, int]] = []
+        for t in (end for s, _, x in added for end in (s, x)):
+            if t not in self._given:
+                self._given.add(t)
+                view = self.chart.seen[t]
+                given.append((t, view, self._choices[t], self._last.get(view)))
+                if len(self._choices[t]) > 1:
+                    self._last[view] = t
+                    far += [(t, int(u)) for u in np.flatnonzero(self._far(t) & self._open)] if self._tells_far else []
+                    self._open[t] = True
+        self._links.update(dict.fromkeys(added))
+        part, batch = f"batch_{self._batches}", self._batches
+        self._asker.control.add(part, [], facts.batch_facts(batch, given, added, far))
+        self._asker.control.ground([(part, [])])
+        self._asker.control.ground([("more", facts.numbers(batch))])
+        self._batches += 1
+
+    def _named_more(self, answer: dict[int, int]) -> bool:
+        """Take more spare names for the views of which the answer uses the rest. Says whether there were any."""
+        used = self._rests(answer)
+        for view in used:
+            self._spares[view] += 1
+        if used:
+            self._restart()
+        return bool(used)
+
+    def _rests(self, answer: dict[int, int]) -> set[int]:
+        """The views of which the answer uses the rest."""
+        return {self._rest[name] for name in answer.values() if name in self._rest}
+
+    def _follow(self, answer: dict[int, int]) -> tuple[list[int], list[Link]]:
+        """The name of every node, following the answer's links from node to node, and the links that it does not explain."""
+        if self.has_all_links and not self._rests(answer):
+            return [answer[node] for node in range(len(answer))], []
+        goes: dict[tuple[int, int], int] = {(answer[t], action): answer[u] for t, action, u in self._links}
+        labels = [-1] * len(self.chart.seen)  # -1: not known
+        followed: list[_Trail] = [None] * len(labels)  # links since the last node that clingo named
+        failed: dict[Link, None] = {}
+        asked: set[tuple[int, int]] = set()  # one such link is asked for, not all
+        labels[0] = answer[0]
+        for link in self.chart.links:
+            t, action, u = link
+            here, key = labels[t], (labels[t], action)
+            there = None
+            if t < u and labels[u] < 0:
+                if here >= 0 and key not in asked:
+                    trail = (link, followed[t])
+                    if key not in goes:
+                        failed[link] = None
+                        asked.add(key)
+                    elif goes[key] not in self._choices[u] or answer.get(u, goes[key]) != goes[key]:
+                        failed.update(self._not_given(trail))
+                    else:
+                        there = goes[key]
+                        followed[u] = None if u in answer else trail
+                labels[u] = answer.get(u, -1) if there is None else there
+            elif here >= 0 and labels[u] >= 0 and goes.setdefault(key, labels[u]) != labels[u]:
+                failed.update(self._not_given((link, followed[t])))
+                failed.update(self._not_given(followed[u]))
+        excluded = {node for pair in self.chart.excluded if labels[pair[0]] == labels[pair[1]] >= 0 for node in pair}
+        if excluded:
+            failed.update((link, None) for link in self.chart.links if link not in self._links and not excluded.isdisjoint(link[::2]))
+        return labels, list(failed)
+
+    def _not_given(self, trail: _Trail) -> Iterator[tuple[Link, None]]:
+        """The links on a trail that clingo does not know."""
+        while trail is not None:
+            link, trail = trail
+            if link not in self._links:
+                yield link, None

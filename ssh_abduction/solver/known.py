@@ -1,0 +1,65 @@
+"""What a search knows of a trace so far: it only ever gets better."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ssh_abduction.asp.limits import Stop
+from ssh_abduction.engines.base import Cost, Found
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver.result import Bound, Status
+from ssh_abduction.theory.theory import Theory
+
+
+class Known:
+    """What is known of the maps of a trace.
+
+    status    what is known in all
+    best      the best map of the whole trace, if there is any
+    cost      what that costs: the preferred counts, first to last
+    bound     proven lower bounds
+    lower     what every map of the trace costs at least, as a prefix showed; None where none has yet
+    partial   the best map of a prefix that was found last
+    stopped   why the search ended before it was complete, if it did
+    complete  whether no further minimal map exists
+    count     how many minimal maps were given
+    """
+
+    def __init__(self, theory: Theory) -> None:
+        self.status = Status.UNKNOWN
+        self.best: SSHMap | None = None
+        self.cost: tuple[int, ...] = ()
+        self.bound = Bound()
+        self.lower: tuple[int, ...] | None = None
+        self.partial: SSHMap | None = None
+        self.stopped: Stop | None = None
+        self.complete = False
+        self.count = 0
+        self._theory = theory
+
+    def is_better(self, found: Found) -> bool:
+        """Whether a map of the trace, or of a prefix, costs less than the best."""
+        return self.best is None or found.cost < self.cost
+
+    def keep(self, found: Found, labels: tuple[int, ...]) -> None:
+        """Take a map for the best; with these labels it is one of the whole trace."""
+        self.best, self.cost = replace(found.map, labels=labels), found.cost
+
+    def raise_bound(self, proven: int | None) -> None:
+        """No map has fewer than this of what is preferred first."""
+        first = self._theory.priorities[0] if self._theory.priorities else None
+        if first and proven is not None and proven > (getattr(self.bound, first) or 0):
+            self.bound = replace(self.bound, **{first: proven})
+
+    def raise_lower(self, cost: tuple[int, ...]) -> None:
+        """No map costs less than this, as a minimal map of a prefix does."""
+        self.raise_bound(cost[0] if cost else None)
+        if self.lower is None or cost > self.lower:
+            self.lower = cost
+
+    @property
+    def best_cost(self) -> Cost | None:
+        """The counts of the best map; where axioms are left out, clingo may count more places or paths than the map can show."""
+        if self.best is None:
+            return None
+        return replace(Cost.of(self.best), **dict(zip(self._theory.priorities, self.cost, strict=True)))

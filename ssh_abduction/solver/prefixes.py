@@ -1,0 +1,182 @@
+"""Solve for a prefix, replay its maps to the end of the trace, and extend the prefix where they fail.
+
+That this is exact is proven in `solver/search.py`. Where an axiom does not survive the cut to a prefix, the prefix is the whole trace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import replace
+
+from ssh_abduction.asp import facts
+from ssh_abduction.asp.limits import LimitError
+from ssh_abduction.engines.base import Engine, Found, Task
+from ssh_abduction.engines.refusing import first_accepted
+from ssh_abduction.engines.stepwise import StepEngine
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.known import Known
+from ssh_abduction.solver.result import Status
+from ssh_abduction.steps.log import Outcome, Replay
+from ssh_abduction.theory.evidence import Equality
+
+FIRST_PREFIX = 8  # The first prefix has so many steps: solving it costs next to nothing.
+HELD_BACK = 1000  # So many maps are kept until a prefix proves long enough; from there on they stream, so that memory stays constant.
+FIRST_PATHS = (
+    8  # So many names for paths there are to begin with: few traces need more, and grounding grows with the square of their number.
+)
+
+
+class Prefixes:
+    """Finds the minimum, and lists the minimal maps, by growing prefixes.
+
+    engine  holds the axioms for the prefix
+    start   the first prefix that is solved
+    """
+
+    def __init__(self, task: Task, known: Known, judging: Judging, engine: Engine, most: int, report: Callable[[], None]) -> None:
+        """Nothing is solved yet.
+
+        most    maps that are asked for; 0 for all
+        report  is called now and then
+        """
+        self.engine = engine
+        self._task, self._known, self._judging, self._most, self._report = task, known, judging, most, report
+        self._whole = not task.speedups.prefixes
+        self.start = len(task.trace) if self._whole else FIRST_PREFIX
+
+    def go_on_with(self, engine: Engine, start: int) -> None:
+        """Solve with another engine, from a prefix of so many steps on."""
+        self.engine, self.start = engine, start
+
+    def find_minimum(self) -> None:
+        """Extend the prefix until a minimal map of it replays to the end, or until it has no map; and set the status to that."""
+        size, steps = min(len(self._task.trace), self.start), len(self._task.trace)
+        while True:
+            if size == steps:
+                self._task.watch.use_reserve()  # which is for a search like this one
+            self.engine.grow(size)
+            minimal = self.minimise()
+            if minimal is None:
+                self._known.status = Status.UNSATISFIABLE
+                return
+            self._known.raise_lower(minimal.cost)
+            replayed = self._replay(minimal.map)
+            if self._predicts_all(minimal, replayed):
+                self._known.keep(minimal, replayed.labels)
+            if self._known.best is not None and self._known.cost <= minimal.cost:  # a map of the whole trace, as cheap as any of the prefix
+                self._known.status = Status.OPTIMAL
+                return
+            size = self.engine.next_size(len(replayed.labels))
+
+    def minimise(self) -> Found | None:
+        """A minimal map of the prefix that no evidence refuses, or None where it has no map."""
+        return first_accepted(self._minimise_as_told, lambda found: self._judging.why_refused(found.map), self._forbid)
+
+    def _forbid(self, equalities: frozenset[Equality]) -> None:
+        """Let no map have all of these equalities; where the engine cannot be told, another one goes on that can."""
+        if self.engine.forbid(equalities):
+            return
+        self.engine.settle()
+        size, theory = self.engine.size, self._task.theory
+        self.engine = StepEngine(self._task, facts.most_paths(self._task.trace, theory, len(self._task.trace)))
+        self.engine.grow(size)
+        self.engine.forbid(equalities)
+
+    def _minimise_as_told(self) -> Found | None:
+        """A minimal map of the prefix by what clingo was told, or None. Better maps of the whole trace are kept on the way."""
+        while True:
+            minimal = None
+            for found in self.engine.improving_maps(self._known.cost if self._known.best and not self._whole else ()):
+                minimal = found
+                self._known.partial = found.map
+                replayed = self._replay(found.map)
+                if self._known.is_better(found) and self._predicts_all(found, replayed):
+                    self._known.keep(found, replayed.labels)
+                    self._task.watch.use_reserve()
+                self._report()
+                if not self._whole and self._known.lower is not None and found.cost <= self._known.lower:
+                    break
+            if not self._name_more_paths(minimal.cost if minimal else None):
+                return minimal
+
+    def _predicts_all(self, found: Found, replayed: Replay) -> bool:
+        """Whether a map of the prefix is one of the whole trace, that no evidence refuses."""
+        whole = replayed.outcome is Outcome.PREDICTED
+        return whole and not self._judging.why_refused(replace(found.map, labels=replayed.labels))
+
+    def _name_more_paths(self, cost: tuple[int, ...] | None) -> bool:
+        """Take a control with more names for paths, if the minimal cost found needs them. Says whether it was so."""
+        needed = self._paths_needed(cost)
+        if needed <= self.engine.paths:
+            return False
+        size = self.engine.size
+        self.engine = self.engine.with_paths(needed)
+        self.engine.grow(size)
+        return True
+
+    def _paths_needed(self, cost: tuple[int, ...] | None) -> int:
+        """How many names for paths it takes to be sure that no map of the prefix has another cost, or is missed at this one."""
+        theory = self._task.theory
+        segments = facts.most_paths(self._task.trace, theory, self.engine.size)
+        first = theory.priorities[0] if theory.priorities else None
+        if theory.level == "causal":
+            return 0
+        if cost is None or not self._task.speedups.path_names or first not in ("paths", "dstates"):
+            return segments
+        if first == "paths":
+            return cost[0]
+        return min(segments, cost[0] // (1 if "course_needs_travel" in theory.given_up else 2))
+
+    def minimal_maps(self) -> Iterator[SSHMap]:
+        """Every map of minimal cost, once, after those of the longest prefix that is needed have been seen to replay."""
+        streamed: list[int] = []  # prefixes whose completely replayed maps went out already
+        held: list[SSHMap] = []  # maps of this prefix that replay
+        try:
+            while True:
+                held.clear()
+                stuck = yield from self._maps_of_prefix(held, streamed)
+                if not stuck:
+                    break
+                self.engine.grow(self.engine.next_size(stuck))
+                self._name_more_paths(self._known.cost)
+        except LimitError:
+            yield from held  # they replay at the proven cost: they are minimal
+            raise
+        yield from held
+
+    def _maps_of_prefix(self, held: list[SSHMap], streamed: list[int]) -> Generator[SSHMap, None, int]:
+        """Hold back the minimal maps of this prefix that replay to the end, or give them where they are many or the prefix is the whole trace.
+
+        Returns the farthest step that some map fails at; 0 where all replay, so that there are no others.
+        """
+        enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
+        streaming = self.engine.size == len(self._task.trace)
+        stuck = 0
+        for found in self.engine.maps_of_cost(self._known.cost, self._most and self._most + 1):
+            replayed = self._replay(found.map)
+            if replayed.outcome is not Outcome.PREDICTED:
+                stuck = max(stuck, len(replayed.labels))
+                if not streaming:
+                    break
+                continue
+            whole = replace(found.map, labels=replayed.labels)
+            was_given = any(self._replay(found.map, size).outcome is Outcome.PREDICTED for size in streamed)
+            if was_given or self._judging.why_refused(whole):
+                continue
+            if streaming:
+                yield whole
+                continue
+            held.append(whole)
+            if len(held) == enough:
+                streaming = True
+                yield from held
+                held.clear()
+        if stuck and streaming:
+            streamed.append(self.engine.size)
+        return stuck
+
+    def _replay(self, ssh_map: SSHMap, known: int | None = None) -> Replay:
+        """The trace replayed over a map of a prefix, of which so many steps make links."""
+        log = self._task.log
+        return log.replay(ssh_map.labels, known, [s.place for s in ssh_map.dstates] if log.pairs else None)
