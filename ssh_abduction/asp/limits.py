@@ -66,6 +66,7 @@ class Watch:
 
     @property
     def has_reserve(self) -> bool:
+        """Whether a share of the time limit is still kept for finding any map."""
         return self._allowed != self._limit
 
     @property

@@ -20,9 +20,18 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
 
-OF_STEPS = {"view", "act", "kind", "turns", "open", "excluded", "elsewhere", "one"}  # facts of a trace, which come step by step
-READABLE = {"axiom", "path", "prefer", "defeasible"}  # facts of a theory
-PARTS = {"base": 0, "step": 1, "check": 1}  # the program parts that are grounded, and how many parameters each has
+OF_STEPS = {
+    "view",
+    "act",
+    "kind",
+    "turns",
+    "open",
+    "excluded",
+    "elsewhere",
+    "one",
+}  # the predicates of a trace's facts, which come step by step
+READABLE = {"axiom", "path", "prefer", "defeasible"}  # the predicates of a theory's facts
+PARTS = {"base": 0, "step": 1, "check": 1}  # the program parts that are grounded, with the number of their parameters
 ALLOWED = {ast.ASTType.Rule, ast.ASTType.Program, ast.ASTType.Definition, ast.ASTType.Defined, ast.ASTType.Comment}
 EXAMPLE = "% @axiom(brief) No dstate is seen again later.\n#program step(t).\nviolation(brief,t) :- same(I,t), t-I > 10."
 
@@ -36,6 +45,7 @@ def check_rules(theory: Theory) -> None:
 
 @lru_cache(maxsize=64)
 def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> None:
+    """Check one file of rules, which may use what the others and these encodings define."""
     of_steps, known = _predicates(files)
     statements = _statements(rules)
     own = {name for other in others for statement, _, _ in _statements(other) for name in _heads(statement)}

@@ -368,6 +368,7 @@ class _ToldClasses(_Classes):
             self.make(merge)
 
     def _snapshot(self) -> _Snapshot:
+        """What `_make_anew` needs to come back to the classes as they are now."""
         return self.root.copy(), self.known.copy(), self._apart.copy(), list(self._members), list(self._leads)
 
     def _keeps_what_is_told(self) -> bool:

@@ -263,6 +263,7 @@ class Sketch:
         return observation(step, self._theory)[1]
 
     def _must_show(self, there: int, step: Step) -> None:
+        """Raises _Contradiction where a step does not show what was seen at this dstate before."""
         if self._states[there].seen != observation(step, self._theory):
             raise _Contradiction
 

@@ -215,7 +215,7 @@ TABLE = (
     Speedup(
         "clique",
         "clique",
-        "Steps, or stretches of paths, no two of which can be one, are given names of their own.",
+        "Steps, or segments of paths, no two of which can be one, are given names of their own.",
         _any_theory,
         CAUSAL,
         EVERY,
