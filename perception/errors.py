@@ -1,4 +1,4 @@
-"""What perception cannot do, and what it did in spite of poor images."""
+"""Errors and warnings of perception."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ class PerceptionError(SSHError, ValueError):
 
 
 class ImageWarning(UserWarning):
-    """Images were poor but usable; the text counts what was replaced, or says what was assumed."""
+    """Images were poor, but could be used. The text says how much of them was replaced, or what was assumed."""
 
 
 def equal_length(images: Any) -> Any:
-    """The images, as they came. Raises PerceptionError where they are a list of unequal lengths, which numpy reports obscurely."""
+    """The images, unchanged. Raises PerceptionError where they are a list of unequal lengths, as numpy's own message for that is hard to understand."""
     if isinstance(images, list | tuple):
         lengths = [len(image) if hasattr(image, "__len__") else 0 for image in images]
         for i, length in enumerate(lengths):

@@ -1,4 +1,4 @@
-"""The images of a trace as one table."""
+"""Makes one table of the images of a trace."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from perception.errors import PerceptionError
 from ssh_abduction.trace import Trace
 
-LARGEST = 4 * 2**30  # bytes of a sidecar file once unpacked
+# Bytes that a sidecar file may have once it is unpacked: a small archive may claim to hold more than the memory.
+LARGEST = 4 * 2**30
 
 
 def images_of(trace: Trace) -> NDArray[np.float64]:
-    """The images of all steps, (n, d) ranges in metres, inline or from the sidecar file (.npy, or .npz with one array or `images`).
+    """The images of all steps, (n, d) ranges in metres. They stand in the trace or in its sidecar file: .npy, or .npz with one array or with `images`.
 
     Raises PerceptionError where a step has no image, lengths differ, or the sidecar file cannot be read.
     """
@@ -45,6 +46,7 @@ def images_of(trace: Trace) -> NDArray[np.float64]:
 
 
 def _sidecar(trace: Trace) -> NDArray[np.float64]:
+    """The table in the sidecar file of a trace."""
     if trace.images is None:
         raise PerceptionError(f"{trace.at(0)}: image: expected the header to name a file of images for the indices, got none; add images")
     path = Path(trace.source or ".").parent / trace.images
@@ -61,7 +63,7 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
         ) from None
     except PerceptionError:
         raise
-    except Exception as error:  # a damaged archive fails in as many ways as it has parts: zlib.error, MemoryError, AttributeError, …
+    except Exception as error:  # each part of a damaged archive fails in its own way: zlib.error, MemoryError, AttributeError, …
         why = f"{type(error).__name__}: {error}"
         raise PerceptionError(f"{path}: expected a .npy or .npz file of images, got something else ({why}); write it again") from None
     if len(shape) != 2 or not floats:
@@ -70,7 +72,7 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
 
 
 def _affordable(file: BinaryIO) -> None:
-    """Raises PerceptionError where an archive, once unpacked, would not fit into memory: a small one may claim to hold anything."""
+    """Raises PerceptionError where an archive would have more than LARGEST bytes once it is unpacked."""
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
             unpacked = sum(part.file_size for part in archive.infolist())

@@ -1,20 +1,20 @@
-"""How well a clustering separates images, without knowing the truth (M) and knowing it (U).
+"""Measures how well a clustering separates images: without knowing the truth (M), and knowing it (U).
 
 >>> import numpy as np
 >>> images = np.array([[0.0], [1.0], [5.0], [6.0]])
 >>> float(cluster_quality(images, [0, 0, 1, 1]))
 4.0
 
-M of many labelings of the same images shares its costly half. The smallest distance between two images of different clusters
-is, for *any* labeling, the length of the shortest edge of a minimum spanning tree whose ends have different labels: `spanning_tree`
-finds the tree once, and `SpanningTree.separation` then reads the distance off n - 1 edges.
+Where M is wanted for many labelings of the same images, the costly half of the work is done once. For *any* labeling, the smallest distance
+between two images of different clusters is the length of the shortest edge of a minimum spanning tree whose ends have different labels. So
+`spanning_tree` finds the tree once, and `SpanningTree.separation` then reads the distance off n - 1 edges.
 
     Proof. Let (a, b) be a closest pair with different labels, and S the images labelled like a. The tree joins a to b, so its path
     from a to b leaves S by an edge e, whose ends are labelled differently, hence |e| >= |ab|. If |e| > |ab|, replacing e by (a, b) would
     give a shorter spanning tree: a contradiction. So |e| = |ab|, and no edge that crosses can be shorter.
 
-Distances here are exact to rounding: matrix products only tell which pairs cannot matter, by a rigorous bound of their rounding error,
-and the pairs that are left are computed from differences in float64. A block at a time is in memory, never all pairs.
+Distances here are exact to rounding. Matrix products only tell which pairs cannot matter, with a rigorous bound of their rounding error, and
+the distances of the pairs that are left are computed from differences in float64. Only one block of pairs is in memory at a time.
 
 References: Kuipers and Beeson, "Bootstrap Learning for Place Recognition", AAAI 2002, eq. 5 (M), and "Clustering" (U).
 """
@@ -40,10 +40,14 @@ from perception.errors import PerceptionError, equal_length
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
-CELL = 256  # images a cell: small enough to skip far ones, large enough for products to be fast
-BATCH = 64  # pairs of cells between two looks at what may still be skipped
-BLOCK = 2048  # images a side of a block, when a cluster is compared with itself
-GATHERED = 8192  # pairs recomputed from differences at once
+# The most images of a cell. Small cells let more pairs of far images be skipped; large ones make the products of matrices faster.
+CELL = 256
+# So many pairs of cells are compared before those left are looked at again, as more of them may be skipped by then.
+BATCH = 64
+# When a cluster is compared with itself, blocks have this many images a side: as float32 a block of distances takes 16 MB.
+BLOCK = 2048
+# So many pairs of images are recomputed from differences at once: with 180 ranges an image, the differences take 12 MB.
+GATHERED = 8192
 
 
 @dataclass(frozen=True)
@@ -70,14 +74,17 @@ class SpanningTree:
 
 
 def cluster_quality(X: ArrayLike, labels: ArrayLike, tree: SpanningTree | None = None) -> float:
-    """M of eq. 5: the smallest distance between images of two clusters over the largest within one. Larger is better.
+    """M of eq. 5: the smallest distance between images of two clusters, divided by the largest distance within one cluster. Larger is better.
 
-    Parameters: X, (n, d) images, finite; labels, (n,), each value one cluster (DBSCAN's -1 too); tree, `spanning_tree(X)`, where M of many
-    labelings is wanted. Returns M in [0, inf], or NaN where it is not defined:
+    X       (n, d) images, finite
+    labels  (n,), where each value is one cluster, DBSCAN's -1 among them
+    tree    `spanning_tree(X)`, to save time where M is wanted for many labelings
 
-    - one cluster: NaN, as there is no distance between clusters;
-    - clusters that share an image, so also all images equal: 0;
-    - different clusters, each of equal images (or of one): infinite.
+    Returns M in [0, inf]. In the limiting cases it is
+
+    - NaN for one cluster, as there is no distance between clusters;
+    - 0 for clusters that share an image, so also where all images are equal;
+    - infinite for different clusters each of which consists of equal images (or of one image).
 
     Raises PerceptionError for labels of another length, ValueError for images that are not finite.
     """
@@ -93,10 +100,10 @@ def cluster_quality(X: ArrayLike, labels: ArrayLike, tree: SpanningTree | None =
 
 
 def uncertainty_coefficient(views: ArrayLike, truth: ArrayLike) -> float:
-    """U(v|x): the share of the uncertainty about the view v that the true state x takes away, I(v; x) / H(v), in [0, 1].
+    """U(v|x) = I(v; x) / H(v), in [0, 1]: which share of the uncertainty about the view v is gone once the true state x is known.
 
-    1 says that the state determines the view, so that variability is gone; several states may share a view (aliasing costs nothing here).
-    A single view has no uncertainty to take away: 1. Raises PerceptionError where the lengths differ or are 0.
+    U is 1 where the state determines the view, so that images of one state have one view. Several states may share a view, as aliasing does not
+    lower U. A single view leaves no uncertainty, so that U is 1. Raises PerceptionError where the lengths differ or are 0.
     """
     seen, true = _numbered(views), _numbered(truth)
     if len(seen) != len(true):
@@ -108,10 +115,10 @@ def uncertainty_coefficient(views: ArrayLike, truth: ArrayLike) -> float:
 
 
 def spanning_tree(X: ArrayLike) -> SpanningTree:
-    """A minimum spanning tree of the images, (n, d), by Borůvka's rounds over blocks of pairs; O(n) memory beside the images.
+    """A minimum spanning tree of the images, (n, d), by Borůvka's rounds over blocks of pairs. It takes O(n) memory beside the images.
 
-    Each round, every component picks its shortest edge to another. Picks are added from short to long unless they would close a cycle,
-    which keeps the forest inside a minimum spanning tree also where lengths are equal.
+    In each round, every component picks its shortest edge to another component. The picks are added from short to long, but for those that would close a
+    cycle; so the forest stays part of a minimum spanning tree even where lengths are equal.
     """
     images = check_array(equal_length(X), dtype=np.float64)
     cells, count = _Cells(images), len(images)
@@ -129,9 +136,10 @@ def spanning_tree(X: ArrayLike) -> SpanningTree:
 
 
 def cluster_spread(X: ArrayLike, labels: ArrayLike) -> float:
-    """The largest distance between two images of one cluster; 0 where every cluster holds equal images.
+    """The largest distance between two images of one cluster; 0 where the images of each cluster are equal.
 
-    A pair is no farther apart than the sum of its distances from the cluster's centre: what cannot beat the best so far is skipped.
+    Two images are no farther apart than their distances from the centre of the cluster together. Pairs that cannot exceed the largest distance so far are
+    skipped.
     """
     images = check_array(equal_length(X), dtype=np.float64)
     clusters = _numbered(labels, len(images))
@@ -144,14 +152,14 @@ def cluster_spread(X: ArrayLike, labels: ArrayLike) -> float:
 
 
 def _separation(images: Floats, clusters: Integers) -> float:
-    """The smallest distance between two clusters, for one labeling: a single round, in which the clusters are the components."""
+    """The smallest distance between two clusters: one round of Borůvka's, in which the clusters are the components."""
     return math.sqrt(float(_Cells(images).shortest_leaving(clusters)[0].min()))
 
 
 class _Cells:
-    """Images in cells of near ones, and for each pair of cells a lower bound of the squared distance between components.
+    """Images, put into cells of near ones. For each pair of cells there is a lower bound of the squared distance between images of different components.
 
-    Components only ever merge, so the distance between those in a pair of cells only grows, and a bound stays true in later rounds.
+    Components only ever merge. So that distance only grows for a pair of cells, and a bound stays true in later rounds.
     """
 
     def __init__(self, images: Floats) -> None:
@@ -175,7 +183,9 @@ class _Cells:
         """For each component, 0 … c - 1 of `components`, the squared length (c,) and ends (c, 2) of the shortest edge that leaves it."""
         search = _Search(self.images, components[self.order])
         pairs = np.argsort(self.bounds, kind="stable")
-        with threadpool_limits(1, user_api="blas"):  # products this small lose more by waiting for threads than they win
+        with threadpool_limits(
+            1, user_api="blas"
+        ):  # products are so small here that threads would wait for each other longer than they work
             while len(pairs):
                 limits = np.maximum.reduceat(search.best[search.components], self.starts[:-1])
                 pairs = pairs[self.bounds[pairs] < np.maximum(limits[self.first[pairs]], limits[self.second[pairs]])]
@@ -209,12 +219,17 @@ class _Search:
         self.ends = np.zeros((len(self.best), 2), np.intp)
 
     def improve(self, lower: Floats, slack: float, row: int, column: int) -> None:
-        """Offer pairs by lower bounds of their squared distances; `row` and `column` say which images the block begins with."""
+        """Look through a block of pairs for shorter edges.
+
+        lower   lower bounds of the squared distances of the pairs
+        row     the image that the rows of the block begin with
+        column  the image that its columns begin with
+        """
         components, least = self.components[row : row + len(lower)], lower.min(axis=1)
         hot = np.flatnonzero(least < self.best[components])
         if not len(hot):
             return
-        # The nearest by the products first: what remains after it is little more than ties.
+        # The pair that is nearest by the products is offered first: after it, hardly any other pair is still below the limit.
         self._offer(row + hot, column + lower[hot].argmin(axis=1))
         limits = self.best[components[hot]]
         hot = hot[(least[hot] < limits) & (limits > 0)]
@@ -232,7 +247,7 @@ class _Search:
 
 
 def _halves(images: Floats, members: Integers) -> Iterator[Integers]:
-    """Split at the median along the line between two far images, until a cell is small."""
+    """Cells of at most CELL images: images are split at the median along the line between two far ones, again and again."""
     if len(members) <= CELL:
         yield members
         return
@@ -246,13 +261,13 @@ def _halves(images: Floats, members: Integers) -> Iterator[Integers]:
 
 
 def _two_sweeps(images: Floats) -> float:
-    """A distance within the images that is often near the largest: from the image farthest from the centre, the farthest."""
+    """A distance that is often near the largest one between two of the images: from the image that is farthest from the centre to the image farthest from that."""
     start = images[_squares(images - images.mean(axis=0)).argmax()]
     return math.sqrt(_squares(images - start).max())
 
 
 def _wider(images: Floats, best: float) -> float:
-    """The largest distance between two of the images if it is over `best`, and something not over it otherwise."""
+    """The largest distance between two of the images, if it is larger than `best`; else some number that is not larger than `best`."""
     centred = images - images.mean(axis=0)
     radii = np.sqrt(_squares(centred))
     margin = 1 + 1e-12  # the radii are rounded too
@@ -291,12 +306,12 @@ def _squares(differences: Floats) -> Floats:
 
 
 def _rounding(beams: int, dtype: type[np.floating[Any]], reach: float) -> float:
-    """How wrong |a|² + |b|² - 2ab can be, where |a| + |b| <= reach: the bound of a dot product's error, and of the inputs' rounding."""
+    """A bound of the rounding error of |a|² + |b|² - 2ab, where |a| + |b| <= reach: that of a dot product, and of the rounding of its inputs."""
     return float((beams + 16) * np.finfo(dtype).eps * reach**2)
 
 
 def _numbered(labels: ArrayLike, count: int | None = None) -> Integers:
-    """Labels as numbers 0, 1, ...; PerceptionError where they are not a row of `count`."""
+    """Labels as numbers 0, 1, … Raises PerceptionError where they are not a row, or are not `count`."""
     of = np.asarray(labels)
     if of.ndim != 1 or not len(of) or (count is not None and len(of) != count):
         raise PerceptionError(

@@ -1,4 +1,4 @@
-"""Ranges to reciprocals: what is near matters most, and "nothing seen" is simply far.
+"""Makes reciprocals of ranges: so what is near matters most, and "nothing seen" is simply far away.
 
 >>> ReciprocalTransformer().fit_transform([[0.5, 2.0, 100.0]])
 array([[2.  , 0.5 , 0.01]])
@@ -18,13 +18,13 @@ from perception.errors import ImageWarning, PerceptionError, equal_length
 
 
 class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """1 / max(r, floor), for images of ranges r in metres, (n, d). Distances between images are Euclidean on these (Kuipers and Beeson 2002).
+    """Makes 1 / max(r, floor) of images of ranges r in metres, (n, d). Distances between images are Euclidean on these (Kuipers and Beeson 2002).
 
     floor: the shortest range that is believed, in metres, > 0.
 
-    A laser says "nothing seen" with +inf, and some drop a beam as NaN: both become 0, infinitely far. Ranges of zero or less are no
-    measurement: they are clipped to the floor. `transform` counts these in one ImageWarning; ranges between 0 and the floor are clipped
-    without one. Raises PerceptionError for a floor that is not a positive number, ValueError for images that are not an (n, d) table.
+    Lasers report "nothing seen" as +inf, and some report a lost beam as NaN: both become 0, which is infinitely far. Ranges of zero or less are no
+    measurements, and are raised to the floor. `transform` counts all of these in one ImageWarning; ranges between 0 and the floor are raised without a
+    warning. Raises PerceptionError for a floor that is not a positive number, ValueError for images that are not an (n, d) table.
     """
 
     def __init__(self, floor: float = 0.05) -> None:

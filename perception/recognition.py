@@ -1,4 +1,4 @@
-"""Images to places, once the map has labelled them: the nearest image seen before tells where the robot is.
+"""Recognises places in images, once the map has labelled images: the nearest image seen before tells where the robot is.
 
 >>> recogniser().fit([[1.0, 4.0], [3.0, 3.0]], ["corner", "hall"]).predict([[1.1, 4.2]]).tolist()
 ['corner']
@@ -40,10 +40,10 @@ class PlaceRecognizer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         number = self.n_neighbors
         if not isinstance(number, int | np.integer) or isinstance(number, bool) or not 1 <= number <= len(images):
             raise PerceptionError(f"n_neighbors: expected a whole number from 1 to the {len(images)} images, got {number!r}")
-        with warnings.catch_warnings():  # dstates seen once or twice are no sign of regression
+        with warnings.catch_warnings():  # scikit-learn takes labels for numbers to regress on where many of them occur once or twice
             warnings.filterwarnings("ignore", "The number of unique classes")
             check_classification_targets(labels)
-            # Trees do not help in 180 dimensions, and a table of images is the safer thing to store.
+            # A tree of images does not help in 180 dimensions, and a plain table of images is safer to store.
             self.neighbours_ = KNeighborsClassifier(number, algorithm="brute").fit(images, labels)
         self.classes_ = self.neighbours_.classes_
         return self
@@ -80,12 +80,12 @@ def recogniser(floor: float = 0.05, n_neighbors: int = 1) -> Pipeline:
 
 @dataclass(frozen=True)
 class LearningCurve:
-    """Recognition rate against experience.
+    """The recognition rate by the number of images seen.
 
     sizes      (s,) how many images, from the first on, had been seen
-    mean, lowest, highest  (s,) share of images recognised, in [0, 1], over the folds
+    mean, lowest, highest  (s,) the share of images recognised, in [0, 1], over the folds
     folds      how many folds there were
-    untested   classes with a single image, which are never tested: without it they cannot be known
+    untested   classes with a single image. They are never tested, as nothing is known of them once that image is left out
     """
 
     sizes: tuple[int, ...]
@@ -104,18 +104,18 @@ def learning_curve(
     random_state: int | np.random.RandomState | None = None,
     estimator: Any = None,
 ) -> LearningCurve:
-    """The recognition rate by cross-validation, against the number of images (Kuipers and Beeson 2002, the learning curves).
+    """The recognition rate, by cross-validation, for growing numbers of images (Kuipers and Beeson 2002, the learning curves).
 
     The n images, (n, d), in the order in which they were seen, are dealt into `folds` parts, each class spread evenly. For each size m and
     each fold, a clone of `estimator` (default: `recogniser()`, so images are ranges in metres) learns from those of the first m images
-    that are not in the fold, and is tested on the whole fold. All sizes are thus tested on the same images, also of places not yet seen
-    after m images: these count as errors. A training part without images recognises nothing.
+    that are not in the fold, and is tested on the whole fold. So all sizes are tested on the same images; those of places that are not among the first m
+    images count as errors. A clone that has no image to learn from recognises nothing.
 
     Raises PerceptionError for sizes outside 1 … n, fewer than 2 folds, or fewer images to test than folds.
     """
     estimator = recogniser() if estimator is None else estimator
     images, labels = np.asarray(equal_length(X)), np.asarray(y)
-    clone(estimator).fit(images, labels)  # what is wrong with the images is said once, here
+    clone(estimator).fit(images, labels)  # so that warnings and errors about the images come once, and not for each fold
     wanted = tuple(int(size) for size in sizes)
     for size in wanted:
         if not 1 <= size <= len(images):
@@ -137,7 +137,7 @@ def learning_curve(
 def _deal(labels: NDArray[Any], folds: int, random_state: Any) -> tuple[NDArray[np.intp], tuple[Any, ...]]:
     """The fold of each image, -1 for those never tested, and the classes that are never tested.
 
-    Cards of one class after the other are dealt round, so that folds differ by at most one image, in all and in every class.
+    Images are dealt round like cards, one class after the other. So the sizes of folds differ by at most one image, in all and within each class.
     """
     if folds < 2:
         raise PerceptionError(f"folds: expected at least 2, got {folds}")

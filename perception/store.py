@@ -1,4 +1,4 @@
-"""A fitted recogniser in a file that cannot run code when it is read.
+"""Keeps a fitted recogniser in a file that cannot run code when it is read.
 
 The file is a skops archive: a description of types and arrays. Reading it makes objects of scikit-learn's own types and of those in
 `OURS`, and refuses anything else; a pickle is not an archive, and is refused unread.
@@ -29,12 +29,13 @@ from ssh_abduction.files import write_file
 
 FORMAT, VERSION = "ssh-recogniser", 1
 OURS = tuple(f"{kind.__module__}.{kind.__qualname__}" for kind in (PlaceRecognizer, ReciprocalTransformer, ViewClusterer))
-LARGEST = 4 * 2**30  # bytes once unpacked: a small archive may claim to hold more than the memory
+# Bytes that a file may have once it is unpacked: a small archive may claim to hold more than the memory.
+LARGEST = 4 * 2**30
 
 
 @dataclass(frozen=True)
 class Stored:
-    """What a file holds.
+    """What the file of a recogniser holds.
 
     model     the fitted estimator or pipeline
     classes   its labels, in order; empty where it has none
@@ -48,8 +49,8 @@ class Stored:
     def labels(self, images: ArrayLike) -> list[int]:
         """The label, a whole number, that the model gives each image, (n, d).
 
-        Raises PerceptionError for images of another length than the model learnt, and for a model that was damaged in its file, which
-        shows nowhere else than in its answers.
+        Raises PerceptionError for images of another length than the model learnt, and for a model that was damaged in its file, which may not
+        show before it answers.
         """
         table = np.asarray(images, np.float64)
         try:
@@ -63,7 +64,7 @@ class Stored:
             sound = found.shape == (len(table),) and found.dtype.kind in "iu"
         except PerceptionError:
             raise
-        except Exception as error:  # what is damaged fails in as many ways as there are parts
+        except Exception as error:  # each part of a damaged model fails in its own way
             raise PerceptionError(f"recogniser: expected one that answers, got {type(error).__name__}: {error}; train it again") from None
         if not sound:
             raise PerceptionError(f"recogniser: expected whole numbers as labels, got {found.dtype} of shape {found.shape}; train it again")
@@ -104,7 +105,7 @@ def load(path: str | os.PathLike[str]) -> Stored:
         raise
     except OSError as error:
         raise PerceptionError(f"{path}: expected a readable recogniser: {error.strerror or error}; check the path") from None
-    except Exception as error:  # a damaged archive fails in as many ways as it has parts
+    except Exception as error:  # each part of a damaged archive fails in its own way
         raise PerceptionError(
             f"{path}: expected a .skops file that train or save wrote, got something else ({type(error).__name__})"
         ) from error
@@ -118,7 +119,7 @@ def load(path: str | os.PathLike[str]) -> Stored:
             raise PerceptionError(f"{path}: {part}: expected a {kind.__name__}, got {_kind(held.get(part))}; save the recogniser again")
     try:
         return Stored(_learnt_again(held["model"]), tuple(held["classes"]), held["versions"])
-    except Exception as error:  # what is damaged fails in as many ways as there are parts
+    except Exception as error:  # each part of a damaged model fails in its own way
         raise PerceptionError(f"{path}: model: expected a fitted one, got {type(error).__name__}: {error}; train it again") from None
 
 
@@ -132,7 +133,7 @@ def _learnt_again(model: Any) -> Any:
 
 
 def _kind(value: object) -> str:
-    """What a value is, as an error message says it. The text of an object that was tampered with may itself be an error."""
+    """A value as an error message shows it. Of objects only the type is shown, as to make a text of one that was tampered with may itself raise."""
     return brief(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
 
 

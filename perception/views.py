@@ -1,4 +1,4 @@
-"""Images to views: clusters, as many as separate best.
+"""Makes views of images: they are clustered, into as many clusters as are separated best.
 
 >>> import numpy as np
 >>> images = np.concatenate([np.random.default_rng(0).normal(c, 0.1, (20, 3)) for c in (0, 2, 5)])
@@ -25,27 +25,30 @@ from threadpoolctl import threadpool_limits
 from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.quality import cluster_quality, spanning_tree
 
-MANY = 5_000  # images up to which k-means starts again and again on all of them; above, on a sample of as many
-ROUNDS = 30  # of k-means at most, where there are so many: first over the sample, then over all from the sample's best centres
+# Up to this many images all starts of k-means are made on all images. Where there are more, the starts are made on a sample of this many, so that the time for
+# them does not grow any further.
+MANY = 5_000
+# Where there are more than MANY images, k-means has at most this many rounds: once over the sample, and once over all images from the best centres of the sample.
+ROUNDS = 30
 
 
 def labels_by_k(clusterer: ViewClusterer, images: ArrayLike) -> dict[int, NDArray[np.intp]]:
-    """The views of the images, (n,), for each k that a fitted clusterer tried, by clustering again with that k."""
+    """The views of the images, (n,), for each k that a fitted clusterer tried. They are clustered again with each k but the chosen one."""
     return {k: clusterer.labels_ if k == clusterer.k_ else clone(clusterer).set_params(k=k).fit(images).labels_ for k in clusterer.quality_}
 
 
 class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
-    """Clusters images, (n, d), into k views; k is given, or is the one in [k_min, k_max] with the largest M (eq. 5), the smallest of equals.
+    """Clusters images, (n, d), into k views. If k is not given, it is the number in [k_min, k_max] with the largest M (eq. 5), or the smallest of several.
 
     Parameters
     ----------
     k             number of views, or None to choose it by M
-    k_min, k_max  the range searched; k_max None is the least of 20 and n - 1. Both yield to the number of different images
-    clusterer     None for k-means, or any scikit-learn clusterer. It is cloned, and `n_clusters` set where it has that parameter;
-                  without (DBSCAN, HDBSCAN) it is used as it is, and finds k itself
-    n_init        starts of k-means. Above 5,000 images the starts are made on a random sample of 5,000, and the best is refined over all
-                  images, both in at most 30 rounds: a view too rare for the sample may then be missed
-    random_state  seed, RandomState or None; the clusterer's own seed, where it has one, comes before
+    k_min, k_max  the range of k that is searched; k_max None stands for the smaller of 20 and n - 1. No k is larger than the number of different images
+    clusterer     None for k-means, or any scikit-learn clusterer. It is cloned, and its `n_clusters` is set to k. A clusterer without that parameter
+                  (DBSCAN, HDBSCAN) is used as it is, and finds k itself
+    n_init        the number of starts of k-means. For more than 5,000 images the starts are made on a random sample of 5,000, and the best one is refined over
+                  all images, both in at most 30 rounds; a view that is too rare for the sample may then be missed
+    random_state  seed, RandomState or None; if the clusterer has a seed of its own, that is used instead
 
     Attributes
     ----------
@@ -55,7 +58,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     cluster_centers_  (k, d), where the clusterer has centres
     clusterer_        the fitted clusterer; None where all images are equal
 
-    All images equal: one view, with an ImageWarning. Raises PerceptionError for settings that contradict each other or the images,
+    If all images are equal, there is one view and an ImageWarning. Raises PerceptionError for settings that contradict each other or the images,
     and ValueError for images that are not a finite (n, d) table with n >= 2.
     """
 
@@ -96,7 +99,9 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return self._keep(best, images)
 
     def predict(self, X: ArrayLike) -> NDArray[np.intp]:
-        """Views of images, (n,): the nearest centre's for k-means (any clusterer's own `predict`), else the nearest fitted image's."""
+        """The views of images, (n,), as the clusterer predicts them (k-means: by the nearest centre). For a clusterer that does not predict, the view of the
+        nearest image that was fitted.
+        """
         check_is_fitted(self)
         images = validate_data(self, equal_length(X), dtype=np.float64, reset=False)
         if self.clusterer_ is None:
@@ -104,7 +109,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return np.asarray((self.clusterer_ if self.nearest_ is None else self.nearest_).predict(images), np.intp)
 
     def _search(self, images: NDArray[np.float64], seed: int) -> Any:
-        """The clusterer at the k with the largest M; sets k_ and quality_."""
+        """A fitted clusterer for the k with the largest M. Sets k_ and quality_."""
         tree = spanning_tree(images)
         most = min(20, len(images) - 1) if self.k_max is None else self.k_max
         most = min(max(most, self.k_min), tree.distinct)
@@ -131,10 +136,12 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
     def _k_means(self, images: NDArray[np.float64], k: int | None, seed: int) -> Any:
         """k-means fitted to all images, from the best of several starts."""
-        with threadpool_limits(1):  # a round is short: two threads wait for each other longer than they work where cores are shared
+        with threadpool_limits(
+            1
+        ):  # rounds are so short that, where cores are shared, two threads wait for each other longer than they work
             if len(images) > MANY:
                 sample = np.random.default_rng(seed).choice(len(images), MANY, replace=False)
-                with warnings.catch_warnings():  # where the sample has fewer different images than views, more are found among all
+                with warnings.catch_warnings():  # if the sample has fewer different images than views, all images may still have enough
                     warnings.simplefilter("ignore", ConvergenceWarning)
                     start = KMeans(k, n_init=self.n_init, max_iter=ROUNDS, random_state=seed).fit(images[sample]).cluster_centers_
                 return KMeans(k, init=start, n_init=1, max_iter=ROUNDS, random_state=seed).fit(images)

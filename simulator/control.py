@@ -1,8 +1,9 @@
-"""Control laws. Each sees laser images and commands motions, and never learns the true pose.
+"""Control laws. Each of them sees laser images and commands motions, and none knows the true pose.
 
-Trajectory-following: along the midline between two walls, or at a fixed distance from one. Hill-climbing: to the fixed point
-that is half a corridor's width from the wall ahead or in the middle of a street to the side, between the walls or at that
-distance from one, with the heading along the walls. Where the image does not show one of these, it stays as it is.
+Trajectory-following leads the robot along the midline between two walls, or along one wall at a fixed distance. Hill-climbing leads it to
+a fixed point. Along its way, that point is half a corridor's width before the wall ahead, or in the middle of a street that opens to a side;
+across its way, it is midway between the walls, or half a corridor's width from the only wall; and the heading is along the walls. Where the image
+does not show one of these, the robot does not correct it.
 Source: Kuipers & Beeson 2002, section on distinctive states; Kuipers 2000, the control level of the hierarchy.
 """
 
@@ -23,19 +24,23 @@ from simulator.world import World
 
 Array = NDArray[np.float64]
 TURNS = {"left": math.pi / 2, "right": -math.pi / 2, "around": math.pi}
-STRIDE = 0.15  # metres between two images while travelling
-STILL = 9  # images whose median is taken at rest: noise shrinks, lost beams vanish
+# Metres that the robot drives between two images while it travels.
+STRIDE = 0.15
+# At rest the robot takes the median of this many images, beam by beam, so that noise is small and a lost beam does not count.
+STILL = 9
+# Hill-climbing looks and moves at most this many times: noise may keep it from ever being within its tolerance.
 TRIES = 12
-LONGEST_TRAVEL = 300.0  # metres
+# A travel of more metres than this has failed: where walls lead round in a circle, it would never end.
+LONGEST_TRAVEL = 300.0
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """When hill-climbing is content: as near as such a base can be steered.
+    """How near to the fixed point hill-climbing ends. The defaults are as near as such a robot can be steered.
 
     close     metres along the way
     straight  radians of heading
-    aside     metres off the line; worse than that, the robot backs off and comes again
+    aside     metres off the line; if it is farther off, the robot backs off and approaches once more
     """
 
     close: float = 0.015
@@ -55,7 +60,7 @@ class Driver:
     on_travel: Callable[[Driver], None] | None = None
 
     def look(self, images: int = 1) -> Array:
-        """An image, (180,) metres; of several, the median beam by beam."""
+        """An image, (180,) metres: the median of so many images, beam by beam."""
         scans = self.laser.scan(self.world, np.repeat([self.robot.pose], images, axis=0), self.rng)
         return np.median(scans, axis=0) if images > 1 else scans[0]
 
@@ -63,7 +68,7 @@ class Driver:
         return sight(self.look(images), self.world.reach, self.laser.reach)
 
     def go(self, forward: float, turn: float = 0.0) -> None:
-        """Move, and make sure that the robot is still where it can be."""
+        """Move the robot. Raises SimulatorError where it leaves the world or hits a wall."""
         self.robot.move(forward, turn)
         x, y, _ = self.robot.pose
         if not self.world.holds(x, y):
@@ -75,7 +80,7 @@ class Driver:
 
 
 def act(driver: Driver, action: str) -> None:
-    """Do an action of a route: its trajectory-following law, then hill-climbing to the dstate where it ends."""
+    """Do an action of a route: follow a trajectory or turn, and then climb to the dstate where the action ends."""
     if action == "travel":
         travel(driver)
         climb(driver)
@@ -85,7 +90,7 @@ def act(driver: Driver, action: str) -> None:
 
 
 def travel(driver: Driver) -> None:
-    """Follow the midline or the wall until the robot is at the next distinctive place."""
+    """Follow the midline or the wall to the next distinctive place."""
     reach = driver.world.reach
     began = driver.robot.driven
     while True:
@@ -108,14 +113,17 @@ def travel(driver: Driver) -> None:
 
 
 def _steer(seen: Sight, reach: float, stride: float) -> float:
-    """Radians to turn on the next stride: towards the line, then along it."""
+    """Radians to turn on the next stride, so that the robot comes to the line and then goes along it."""
     offset = seen.offset(reach)
     wanted = 0.0 if offset is None else -math.atan(1.5 * float(np.clip(offset, -0.5, 0.5)))
     return (wanted - seen.tilt) * min(1.0, abs(stride) / 0.12)
 
 
 def climb(driver: Driver, turned: bool = False) -> None:
-    """Hill-climb to the fixed point: along the way, across it, and in heading. After a turn, only what needs no manoeuvre."""
+    """Hill-climb to the fixed point: along the way, across it, and in heading.
+
+    turned  the action was a turn, after which the robot does not back off to come nearer to the line
+    """
     reach, tolerance = driver.world.reach, driver.tolerance
     for attempt in range(TRIES):
         seen = driver.see(STILL)
@@ -133,7 +141,7 @@ def climb(driver: Driver, turned: bool = False) -> None:
 
 
 def _come_again(driver: Driver) -> None:
-    """Back off a little, and approach along the line."""
+    """Back off a little, and approach the fixed point once more, along the line."""
     reach = driver.world.reach
     back = 0.0
     while back < 0.5 * reach:

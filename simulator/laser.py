@@ -12,16 +12,17 @@ from simulator.world import World
 Array = NDArray[np.float64]
 BEAMS = 180
 BEARINGS: Array = np.radians(np.arange(BEAMS) - 89.5)  # radians, counter-clockwise from straight ahead
-_BLOCK = 4_000_000  # intersections held in memory at once
+# At most this many intersections of beams and walls are computed at once, unless a single image takes more: an array of them has 32 MB.
+_BLOCK = 4_000_000
 
 
 @dataclass(frozen=True)
 class Laser:
-    """What a scan is worth. The defaults are those of the usual scanner of the time: 5 mm of noise, 8 m of range.
+    """A laser range finder. The defaults are those of the usual scanner of the time: 5 mm of noise, 8 m of range.
 
-    noise      standard deviation of a range, metres
-    reach      largest range, metres; what is farther reads as this
-    dropouts   probability that a beam is lost; it reads as the largest range
+    noise      standard deviation of a range, in metres
+    reach      the largest range, in metres; what is farther reads as this
+    dropouts   probability that a beam is lost, which reads as the largest range
     """
 
     noise: float = 0.005
@@ -29,7 +30,7 @@ class Laser:
     dropouts: float = 0.001
 
     def exact(self, world: World, poses: Array) -> Array:
-        """Ranges without noise, (m, 180) metres, from m poses (x, y, heading); one call for many poses."""
+        """Ranges without noise, (m, 180) metres, from m poses (x, y, heading). One call for many poses is faster than many calls."""
         poses = np.atleast_2d(poses)
         rows = max(1, _BLOCK // (BEAMS * len(world.segments)))
         return np.vstack([self._cast(world.segments, poses[i : i + rows]) for i in range(0, len(poses), rows)])
@@ -42,12 +43,13 @@ class Laser:
         return np.clip(ranges, 0.01, self.reach)
 
     def _cast(self, segments: Array, poses: Array) -> Array:
+        """The distance from each pose to the nearest wall along each beam, (m, 180) metres."""
         angles = poses[:, 2, None] + BEARINGS
         dx, dy = np.cos(angles)[:, :, None], np.sin(angles)[:, :, None]
         ax = segments[:, 0] - poses[:, 0, None]
         ay = segments[:, 1] - poses[:, 1, None]
         ex, ey = segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1]
-        # The ray r (dx, dy) meets the wall a + s e where both cross products with the other direction vanish.
+        # The ray r (dx, dy) meets the wall a + s e, 0 <= s <= 1, where r (dx, dy) = a + s e. Cross products with e and with (dx, dy) yield r and s.
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse = 1.0 / (dx * ey - dy * ex)
             r = (ax * ey - ay * ex)[:, None, :] * inverse

@@ -1,4 +1,4 @@
-"""Occupancy maps as ROS stores them: a YAML file that names a PGM image. Its walls become segments between cells."""
+"""Reads occupancy maps as ROS stores them: a YAML file that names a PGM image. The borders of its occupied cells become walls."""
 
 from __future__ import annotations
 
@@ -12,10 +12,14 @@ from simulator.errors import SimulatorError
 from ssh_abduction.errors import brief
 from ssh_abduction.files import read_at_most
 
-FARTHEST = 1e6  # metres, or degrees, of any coordinate: beyond that, the strides of the robot would get lost in rounding
-LONGEST_LINE = 4096  # characters of a line of YAML that can be a field: to look for one takes the square of that
-LARGEST_TEXT = 2**20  # bytes of a YAML file
-LARGEST_IMAGE = 128 * 2**20  # bytes of an image; as floating-point numbers it takes eight times as many
+# The largest coordinate, in metres or degrees: what is farther away is a mistake, and rounding would blur the strides of the robot there.
+FARTHEST = 1e6
+# Only lines of YAML of at most this many characters can be fields, as the time to look for a field grows with the square of the length.
+LONGEST_LINE = 4096
+# Bytes that a YAML file may have: it holds a dozen fields.
+LARGEST_TEXT = 2**20
+# Bytes that an image may have: as floating-point numbers it takes eight times as many, 1 GiB.
+LARGEST_IMAGE = 128 * 2**20
 _BREAK = rb"(?:\s|#[^\n]*\n)+"
 _HEAD = re.compile(rb"(P[25])" + _BREAK + rb"(\d{1,9})" + _BREAK + rb"(\d{1,9})" + _BREAK + rb"(\d{1,9})\s")
 _FIELD = re.compile(r"^\s*(\w+)\s*:\s*(.+?)\s*(?:#.*)?$")
@@ -81,7 +85,7 @@ def read_pgm(path: Path) -> NDArray[np.float64]:
 
 
 def _edges(occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, float], path: Path) -> NDArray[np.float64]:
-    """Borders between occupied and other cells, joined into long segments; row 0 is at the bottom."""
+    """The borders between occupied and other cells, joined into long segments. Row 0 of the cells is at the bottom."""
     found: list[tuple[float, float, float, float]] = []
     for flipped in (False, True):
         cells = occupied.T if flipped else occupied

@@ -1,4 +1,4 @@
-"""A unicycle: it drives forward and turns, neither exactly, and its odometry tells neither exactly."""
+"""A robot that drives forward and turns (a unicycle), neither of them exactly, and whose odometry reports neither of them exactly."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Pose = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Body:
-    """How well a robot drives. Actuation errs by a share of the motion, and the heading wanders with the distance.
+    """How well a robot drives. The motion that it does differs from the command by a share of it, and its heading wanders with the distance.
 
     radius    metres; a wall nearer than this is a collision
     slip      standard deviation of the motion done, as a share of the motion commanded
@@ -32,12 +32,12 @@ class Robot:
     def __init__(self, body: Body, pose: Pose, rng: np.random.Generator) -> None:
         self.body = body
         self.pose = pose
-        self.driven = 0.0  # metres, as odometry has it
-        self.odometry: Pose = (0.0, 0.0, 0.0)  # pose since the start, as odometry has it
+        self.driven = 0.0  # metres driven, as odometry reports them
+        self.odometry: Pose = (0.0, 0.0, 0.0)  # the pose against that at the start, as odometry reports it
         self._rng = rng
 
     def move(self, forward: float, turn: float) -> None:
-        """Command a motion: metres forward (negative: back), and radians of turn on the way."""
+        """Command a motion: so many metres forward (back if negative), and so many radians of turn on the way."""
         e = self._rng.normal(size=5)
         body = self.body
         forward_done = forward * (1 + body.slip * e[0])

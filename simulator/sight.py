@@ -1,7 +1,7 @@
-"""What a robot makes of one laser image: how it stands to the walls around it. Nothing here knows the true pose.
+"""Reads from one laser image how the robot stands to the walls around it. Nothing here knows the true pose.
 
-Walls are taken to meet at right angles. The image is turned until its walls lie along the axes; then the walls ahead and
-alongside, and the far walls of streets that open to the sides, are the lines that most of the image lies on.
+Walls are taken to meet at right angles. The points of the image are turned until the walls lie along the axes. Then the wall ahead, the walls
+alongside, and the far walls of streets that open to the sides are the lines on which most points of the image lie.
 """
 
 from __future__ import annotations
@@ -15,18 +15,20 @@ from numpy.typing import NDArray
 from simulator.laser import BEARINGS
 
 Array = NDArray[np.float64]
-THICK = 0.05  # metres: points so near to each other across a wall are on one wall
-LONG = 0.4  # metres: what is shorter is no wall, but clutter or the end of one
+# Metres: points are on one wall if across it they are at most so far apart. That is ten times the noise of the laser.
+THICK = 0.05
+# Metres that a wall has to be long: what is shorter is clutter, or the end of a wall.
+LONG = 0.4
 
 
 @dataclass(frozen=True)
 class Sight:
-    """Where the walls are, in metres and radians; None where there is no such wall in reach of the laser.
+    """Where the walls are, in metres and radians. A field is None where the laser sees no such wall.
 
     tilt           heading of the robot against the axis of the walls, counter-clockwise
     front          distance to the wall across the way ahead
     left, right    distances to the walls alongside
-    left_street    how far ahead the far wall of a street to the left is; right_street the same to the right
+    left_street    how far ahead the far wall of a street is that opens to the left; right_street is the same to the right
     """
 
     tilt: float
@@ -37,14 +39,17 @@ class Sight:
     right_street: float | None
 
     def to_go(self, reach: float, streets: bool = True) -> float | None:
-        """Metres ahead to the point that is `reach` before the wall ahead, or in the middle of a street that opens to a side."""
+        """Metres ahead to the point that is `reach` before the wall ahead, or in the middle of a street that opens to a side; to the nearer of these.
+
+        streets  whether streets count
+        """
         marks = [self.front] if self.front is not None and self.front < 2.5 * reach else []
         if streets:
             marks += [x for x in (self.left_street, self.right_street) if x is not None and x < 2.5 * reach]
         return None if not marks else min(marks) - reach
 
     def offset(self, reach: float) -> float | None:
-        """Metres that the robot is left of the midline, or of the line `reach` from the one wall alongside."""
+        """Metres that the robot is left of the midline; where there is a wall on one side only, left of the line that is `reach` off that wall."""
         near = 1.5 * reach
         left = self.left if self.left is not None and self.left < near else None
         right = self.right if self.right is not None and self.right < near else None
@@ -56,7 +61,11 @@ class Sight:
 
 
 def sight(image: Array, reach: float, farthest: float) -> Sight:
-    """Read an image, (180,) metres. `reach` is half the width of a corridor; ranges from `farthest` on are nothing seen."""
+    """What an image, (180,) metres, shows.
+
+    reach     half the width of a corridor
+    farthest  the range from which on nothing was seen
+    """
     seen = image < farthest - 0.02
     bearings, ranges = BEARINGS[seen], image[seen]
     points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1)
@@ -68,7 +77,7 @@ def sight(image: Array, reach: float, farthest: float) -> Sight:
     points = _turned(np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1), -axis)
     x, y = points[:, 0], points[:, 1]
     across, along = _spacing(y), _spacing(x)
-    # An axis turned to the left of the robot is a robot turned to the right of the axis.
+    # Where the axis of the walls is turned to the left of the robot, the robot is turned to the right of the axis: hence the minus.
     return Sight(
         tilt=-axis,
         front=_line(x, across, (x > 0.05) & (np.abs(y) < 0.5 * reach)),
@@ -86,7 +95,7 @@ def _turned(points: Array, angle: float) -> Array:
 
 
 def _axis(points: Array) -> float:
-    """The direction of the walls, in -45 to 45 degrees: the mean direction, modulo a right angle, of chords between near points."""
+    """The direction of the walls, between -45 and 45 degrees (in radians): the mean direction, modulo a right angle, of lines between near points."""
     chords = points[8:] - points[:-8]
     length = np.hypot(chords[:, 0], chords[:, 1])
     good = (length > 0.08) & (length < 1.5)
@@ -103,7 +112,7 @@ def _axis(points: Array) -> float:
 
 
 def _finer(points: Array, reach: float) -> float:
-    """What is left of the angle between the walls and the axes: the slopes of the best lines, each as sure as it is long."""
+    """The angle that is left between the walls and the axes: the mean slope of the best lines, in which long lines weigh more."""
     slopes, weights = [], []
     for u, v in ((0, 1), (1, 0)):
         inside = np.abs(points[:, v]) < 3 * reach
@@ -123,12 +132,12 @@ def _finer(points: Array, reach: float) -> float:
 
 
 def _spacing(values: Array) -> Array:
-    """How much of a wall along this axis each point stands for."""
+    """How many metres of a wall along this axis each point stands for."""
     return np.minimum(np.abs(np.gradient(values)), 0.3)
 
 
 def _line(values: Array, weights: Array, chosen: NDArray[np.bool_]) -> float | None:
-    """The value that most of the chosen points share, by length of wall; None where no wall is long enough."""
+    """The value that most of the chosen points share, where each point counts as much as its weight, in metres of wall. None where no wall is LONG enough."""
     picked, length = values[chosen], weights[chosen]
     if len(picked) < 5:
         return None

@@ -1,4 +1,4 @@
-"""Tours: a robot drives a route again and again, and logs at each dstate the image that it sees and the action it takes next."""
+"""Simulates tours: a robot drives a route again and again, and logs at each dstate the image that it sees and the action that it does next."""
 
 from __future__ import annotations
 
@@ -22,7 +22,12 @@ QUARTERS = {"travel": 0, "right": 1, "around": 2, "left": 3}
 
 @dataclass
 class Star:
-    """The openings of the place where the robot is, slot by slot, as it has seen them since it came."""
+    """The openings of the place where the robot is, as it has seen them since it came there.
+
+    reach   half the width of a corridor, in metres
+    slots   whether there is an opening, by slot; slot 0 is the one that the robot faced as it came
+    facing  the slot that it faces now
+    """
 
     reach: float
     slots: dict[int, bool] = field(default_factory=dict)
@@ -30,12 +35,12 @@ class Star:
 
     def act(self, action: str) -> None:
         if action == "travel":
-            self.slots, self.facing = {2: True}, 0  # it came from behind
+            self.slots, self.facing = {2: True}, 0  # behind the robot is the opening through which it came
         else:
             self.facing = (self.facing + QUARTERS[action]) % 4
 
     def look(self, image: Array) -> None:
-        """Openings ahead, right and left are where the nearest wall is far. The half circle shows nothing behind."""
+        """Take the directions ahead, right and left for openings if the wall there is far. What is behind the robot is not in the image."""
         for slot, beams in ((0, image[82:98]), (1, image[:10]), (3, image[-10:])):
             self.slots[(self.facing + slot) % 4] = bool(np.median(beams) > 1.8 * self.reach)
 
@@ -54,7 +59,7 @@ def simulate(
     stars: bool = True,
     every: float | None = None,
 ) -> Trace:
-    """Drive `tours` tours, and log an image at each dstate: (tours x actions) steps, the last without its action.
+    """Drive `tours` tours, and log an image at each dstate: (tours x actions) steps, of which the last one has no action.
 
     stars   also log the openings at each place, as the robot saw them since it came there
     every   log an image each so many metres of odometry instead, wherever the robot is; the trace then has travels only

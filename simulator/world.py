@@ -1,4 +1,4 @@
-"""Worlds: walls as segments in metres, clutter that may move between tours, and where the truth about dstates is known.
+"""Worlds: walls as segments in metres, clutter that may move between tours, and, where it is known, the truth about dstates.
 
 A world is a JSON file that a user can write (docs/worlds.md), or an occupancy map as ROS has it (PGM + YAML).
 
@@ -27,13 +27,15 @@ from ssh_abduction.files import parse_json, read_at_most
 
 Array = NDArray[np.float64]
 FORMAT, VERSION = "ssh-world", 1
-NEAREST = 0.01  # metres of reach: the laser sees no wall nearer than that
-LARGEST = 64 * 2**20  # bytes of a world file
+# The smallest `reach` of a world, in metres: a laser reports no range that is smaller.
+NEAREST = 0.01
+# Bytes that a world file may have.
+LARGEST = 64 * 2**20
 
 
 @dataclass(frozen=True)
 class TrueDState:
-    """Where a dstate really is: for evaluation only. pose is (x, y, heading) in metres and radians."""
+    """Where a dstate really is, for evaluation only. Its pose is (x, y, heading) in metres and radians."""
 
     name: str
     place: str
@@ -44,7 +46,7 @@ class TrueDState:
 
 @dataclass(frozen=True)
 class Clutter:
-    """A closed polygon that is moved by up to `moves` metres in x and y between tours, and is there with probability `present`."""
+    """A closed polygon. For each tour it is moved from where it stands in the file, by up to `moves` metres in x and y, and it is there with probability `present`."""
 
     segments: Array = field(repr=False)
     moves: tuple[float, float] = (0.0, 0.0)
@@ -53,12 +55,13 @@ class Clutter:
 
 @dataclass(frozen=True)
 class World:
-    """Walls and clutter. `segments` is (n, 4): x1, y1, x2, y2 in metres.
+    """Walls and clutter.
 
-    start    pose (x, y, heading) in metres and radians
-    route    actions of one tour, ending where it started
-    reach    metres from a wall at which the robot follows it, half the width of a corridor
-    dstates  the truth, for evaluation only
+    segments  the walls, (n, 4): x1, y1, x2, y2 in metres
+    start     the pose (x, y, heading) in which the robot starts, in metres and radians
+    route     the actions of one tour, which ends where it began
+    reach     the distance at which the robot follows a wall, in metres: half the width of a corridor
+    dstates   the truth, for evaluation only
     """
 
     name: str
@@ -81,7 +84,7 @@ class World:
         return left < x < right and bottom < y < top
 
     def arranged(self, rng: np.random.Generator) -> World:
-        """This world as one tour finds it: the clutter has been moved, and is part of the walls."""
+        """This world as it is on one tour: the clutter has been moved at random, and is part of the walls."""
         parts = [self.segments]
         for item in self.clutter:
             shift = rng.uniform(-1, 1, 2) * np.array(item.moves)
@@ -98,7 +101,7 @@ class World:
         return float(np.hypot(*(a + t[:, None] * along - np.array([x, y])).T).min())
 
     def nearest(self, pose: Sequence[float]) -> TrueDState | None:
-        """The true dstate that is nearest to a pose, where the world knows them; a radian counts like a metre."""
+        """The true dstate that is nearest to a pose, where a radian counts like a metre; None if the world knows no true dstates."""
         if not self.dstates:
             return None
         x, y, heading = pose
@@ -126,7 +129,7 @@ class World:
 
     @classmethod
     def named(cls, name: str) -> World:
-        """A world that ships (notched-rectangle, taylor-hall), or the one in a file: .json, or .yaml of an occupancy map."""
+        """A world that comes with the package (notched-rectangle, taylor-hall), or the one in a file: .json, or .yaml for an occupancy map."""
         shipped = {path.stem: path for path in (Path(str(files("simulator"))) / "worlds").glob("*.json")}
         if name in shipped:
             return cls.load(shipped[name])
@@ -149,7 +152,7 @@ class World:
 
     @classmethod
     def from_occupancy(cls, path: str | os.PathLike[str]) -> World:
-        """The walls of an occupancy map as ROS stores it: a YAML file with image, resolution, origin, occupied_thresh, and its PGM."""
+        """The world whose walls are those of an occupancy map, as ROS stores it: a YAML file with image, resolution, origin and occupied_thresh, and its PGM."""
         name, segments = read_occupancy(Path(path))
         middle = segments.reshape(-1, 2).mean(0)
         return cls(printable(name), segments, start=(float(middle[0]), float(middle[1]), 0.0))

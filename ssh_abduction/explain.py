@@ -21,12 +21,13 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
-POLL = 0.05  # seconds between two questions whether to stop
+# Seconds between two questions whether to stop, while clingo is busy: as in asp/limits.py.
+POLL = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Clash:
-    """An axiom that cannot hold at all of these steps together with the other clashes. A step is the last one involved."""
+    """An axiom that, together with the other clashes, cannot hold at all of these steps. Of the steps that an axiom is about at once, the last one is named."""
 
     axiom: str
     steps: tuple[int, ...]
@@ -34,7 +35,7 @@ class Clash:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Steps `first` to `last` alone have no map. Dropping any one of the clashes, at any of its steps, would give them one."""
+    """Steps `first` to `last` alone have no map. If any one clash is dropped, even at one of its steps only, they have one."""
 
     first: int
     last: int
@@ -54,14 +55,15 @@ class Explanation:
 
 
 class Interrupted(Exception):  # noqa: N818 - not an error
-    """`stop` said that there is no more time."""
+    """The caller's `stop` returned True."""
 
 
 def explain(trace: Trace, theory: Theory | None = None, stop: Callable[[], bool] = lambda: False) -> Explanation | None:
-    """Why the trace has no map under a theory, or None if it has one.
+    """Why the trace has no map under a theory (default Theory.topological()), or None if it has one.
 
-    The stretch is found by dropping steps from the end and from the start, the clashes by dropping axioms one by one. `stop` is asked
-    now and then; when it says yes, Interrupted is raised.
+    The stretch is found by dropping steps from the end and then from the start, the clashes by dropping axioms one by one.
+
+    stop  asked now and then; when it returns True, Interrupted is raised
     """
     theory = (theory or Theory.topological()).resolve(trace)
     theory.check_steps(trace)
@@ -82,12 +84,13 @@ def explain(trace: Trace, theory: Theory | None = None, stop: Callable[[], bool]
 
 
 def _stretch(trace: Trace, first: int, length: int) -> Trace:
+    """So many steps of a trace, as if they were all of it."""
     head = trace.prefix(first + length)
     return replace(head, steps=head.steps[first:])
 
 
 def _shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:
-    """The least length with no map, as more steps never bring one back; None if even the longest has one."""
+    """The least length that has no map; None if even the longest has one. It is found by bisection, as more steps never bring a map back."""
     short, long = 0, 1
     while not has_no_map(long):
         if long == longest:
@@ -100,7 +103,7 @@ def _shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:
 
 
 class _Axioms:
-    """Some steps of a trace, as if they were all of it, and their axioms in clingo; where `relaxed`, each axiom can be switched at each step."""
+    """The axioms of some steps of a trace, in clingo, as if these steps were all of it. Where `relaxed`, each axiom can be switched on or off at each step."""
 
     def __init__(self, trace: Trace, theory: Theory, stop: Callable[[], bool], first: int, length: int, *, relaxed: bool = False) -> None:
         trace, theory = _stretch(trace, first, length), theory.of_steps(first, length)
@@ -126,7 +129,7 @@ class _Axioms:
         self._pairs = {facts.active(axiom, t): (axiom, t) for axiom in theory.axioms for t in range(len(trace))} if relaxed else {}
 
     def consistent(self, active: Sequence[clingo.Symbol] = ()) -> bool:
-        """Whether there is a map. Where the axioms are relaxed, those hold that are active."""
+        """Whether there is a map. Where the axioms are relaxed, only the active ones have to hold."""
         with self._control.solve(assumptions=[(symbol, True) for symbol in active], async_=True) as handle:
             while not handle.wait(POLL):
                 if self._stop():
@@ -135,16 +138,17 @@ class _Axioms:
             return bool(handle.get().satisfiable)
 
     def smallest_clash(self) -> list[tuple[str, int]]:
-        """Pairs of axiom and step that leave no map, while any proper subset of them does.
+        """Pairs of axiom and step that leave no map, while any proper subset of them leaves one.
 
-        There are many such sets. Dropping whole axioms before single steps, from either end, and keeping the smallest result
-        gives one that is short to read.
+        There are many such sets. To get one that is short to read, whole axioms are dropped before single steps, once in the order of the axioms and once
+        in reverse, and the smaller result is returned.
         """
         found = [self._shrunk(list(order)) for order in (self._pairs, reversed(self._pairs))]
         shortest = min(found, key=lambda pairs: (len({self._pairs[p][0] for p in pairs}), len(pairs)))
         return [self._pairs[symbol] for symbol in shortest]
 
     def _shrunk(self, kept: list[clingo.Symbol]) -> list[clingo.Symbol]:
+        """Pairs that still leave no map after all that can be dropped were dropped, in their order."""
         for axiom in dict.fromkeys(self._pairs[symbol][0] for symbol in kept):
             fewer = [symbol for symbol in kept if self._pairs[symbol][0] != axiom]
             if not self.consistent(fewer):

@@ -28,7 +28,7 @@ from ssh_abduction.trace import Trace
 
 
 class LearnerError(SSHError):
-    """The loop cannot be closed: there is no map, or none of its labels is sure."""
+    """The loop cannot be closed: there is no map, or the maps agree on no label."""
 
 
 class AmbiguousMapWarning(UserWarning):
@@ -38,12 +38,12 @@ class AmbiguousMapWarning(UserWarning):
 class BootstrapLearner:
     """Learns to recognise places from a trace of images and actions, without being told any place.
 
-    theory     which axioms; Theory.topological() by default
-    clusterer  images to views; ViewClusterer(random_state=0) by default
-    choose     index of the map to take where several remain; None takes the labels that all of them agree on
-    limit      seconds for the map
+    theory     the axioms; Theory.topological() by default
+    clusterer  makes views of images; ViewClusterer(random_state=0) by default
+    choose     the index of the map to take where several remain; None takes the labels on which all of them agree
+    limit      seconds for finding the map
 
-    After `fit`: clusterer_, views_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree, recogniser_.
+    After `fit` there are clusterer_, views_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree, and recogniser_.
     """
 
     def __init__(self, theory: Theory | None = None, clusterer: Any = None, choose: int | None = None, limit: float | None = None) -> None:
@@ -75,10 +75,10 @@ class BootstrapLearner:
 
 
 def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool = True) -> NDArray[np.intp]:
-    """The label of each step, (n,): the dstate in the chosen map, or in the first, with -1 where the maps disagree.
+    """The label of each step, (n,): its dstate in the chosen map; or, if none is chosen, in the first map, and -1 where the maps disagree.
 
-    Maps agree on a step if the first step at its dstate is the same in all of them. Warns if they do not agree everywhere, or if
-    there may be more maps than these. Raises LearnerError where no map or no label is left.
+    Maps agree on a step if the first step at its dstate is the same in all of them. Warns if no map is chosen and they do not agree
+    everywhere, or if there may be more (`complete` is false). Raises LearnerError where no map or no label is left.
     """
     if not maps:
         raise LearnerError("maps: expected at least one to take labels from, got none; see the solution's status")
@@ -103,6 +103,6 @@ def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool 
 
 
 def _first_steps(ssh_map: SSHMap) -> NDArray[np.intp]:
-    """Of each step, (n,), the first step at its dstate."""
+    """For each step, (n,), the first step at its dstate."""
     _, first, dstates = np.unique(ssh_map.labels, return_index=True, return_inverse=True)
     return np.asarray(first[dstates], np.intp)

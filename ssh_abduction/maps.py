@@ -1,9 +1,9 @@
 """Maps: distinctive states, the links between them, places, and paths with the order of their places.
 
-Maps are values. dstates, places and paths are numbered by first visit, and a path's direction +1 is the one in which it was
-first faced. So two maps of one trace are the same map, up to renaming, exactly when they are equal. Equality looks at the
-dstates, their places and courses, and the links. The order of a path, the headings and the excused pairs are witnesses, one
-of possibly several that show the map to be consistent, and do not count.
+Maps are values. Their dstates, places and paths are numbered by first visit, and the direction +1 of a path is the one in which it was
+first faced. So two maps of one trace are the same map, up to renaming, exactly when they are equal. Equality compares the
+dstates, their places and courses, and the links. It does not compare the orders of paths, the headings and the excused pairs: these are
+witnesses, which show that the map is consistent, and others may show it as well.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 class DState:
     """A distinctive state: a position and a heading that hill-climbing brings the robot to.
 
-    place and path are None where the theory has none; `direction` is +1 or -1, the way the dstate faces along its path;
-    `heading` is the slot (0 to 3, clockwise) of the place's frame that it faces, in theories with star=frame.
+    place, path  None where the theory has none, or the dstate is along no path
+    direction    +1 or -1: the way that the dstate faces along its path
+    heading      the slot (0 to 3, clockwise) of the frame of its place that it faces, in theories with star=frame
     """
 
     id: int
@@ -43,7 +44,7 @@ class DState:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """A street: its places in an order that goes with direction +1. With path_order=partial, one order of several."""
+    """A path: its places in the order in which direction +1 meets them. With path_order=partial this is one of the orders that the map allows."""
 
     id: int
     order: tuple[int, ...]
@@ -70,7 +71,7 @@ class SSHMap:
         return replace(self, dstates=tuple(replace(s, heading=None) for s in self.dstates))
 
     def renumbered(self) -> SSHMap:
-        """The same map with dstates, places and paths numbered by first visit: maps that are the same up to renaming become equal."""
+        """The same map with dstates, places and paths numbered by first visit, so that maps which are the same up to renaming become equal."""
         visited = [self.dstates[s] for s in dict.fromkeys([*self.labels, *range(len(self.dstates))])]
         number = {s.id: i for i, s in enumerate(visited)}
         place = _numbered([*(s.place for s in visited), *self.places])
@@ -172,8 +173,8 @@ class SSHMap:
     def to_networkx(self, level: Literal["causal", "topological"] = "causal") -> nx.Graph[Any]:
         """The map as a graph of networkx.
 
-        causal        MultiDiGraph: a node a dstate (view, place, path, direction), an edge a link (action)
-        topological   Graph: nodes ("place", p) and ("path", h), an edge where the place is on the path (index in its order)
+        causal       a MultiDiGraph: each dstate is a node (with view, place, path, direction), each link an edge (with action)
+        topological  a Graph: its nodes are ("place", p) and ("path", h), and it has an edge where a place is on a path (with its index in the order)
         """
         import networkx as nx
 
@@ -210,7 +211,7 @@ class SSHMap:
         return "\n".join(nx.generate_graphml(graph))
 
     def to_dot(self) -> str:
-        """The causal graph as Graphviz DOT text, with a cluster a place."""
+        """The causal graph as Graphviz DOT text, with a cluster for each place."""
 
         def quoted(text: object) -> str:
             lines = (printable(line) for line in str(text).split("\n"))  # a terminal would obey some characters
@@ -230,7 +231,7 @@ class SSHMap:
 
 
 def _numbered(ids: Iterable[int | None]) -> dict[int | None, int]:
-    """0, 1, 2, … for each id in the order in which they come."""
+    """The ids with the numbers 0, 1, 2, … in the order in which they come."""
     return {number: i for i, number in enumerate(dict.fromkeys(x for x in ids if x is not None))}
 
 

@@ -1,7 +1,7 @@
-"""A map as a picture: streets through places, and at each place the dstates, on the side that they face.
+"""A map as a picture: paths through places, and at each place its dstates, on the side that they face.
 
-The map says nothing of metres, so the layout is one of many. Where all turns fit right angles, streets are drawn at right angles
-and places keep their order along them; elsewhere places are spread so that neighbours are near (Kamada & Kawai 1989).
+The map says nothing of metres, so the layout is one of many. Where all turns fit right angles, paths are drawn at right angles
+and places keep their order along them. Elsewhere places are spread so that neighbours are near each other (Kamada & Kawai 1989).
 """
 
 from __future__ import annotations
@@ -18,22 +18,29 @@ from ssh_abduction.maps import SSHMap, xml_text
 
 Point: TypeAlias = tuple[float, float]
 
+# In units of the page: between neighbouring places, around the picture, the radius of a place, from the middle of a place to the name of a dstate, and how far a
+# dstate is drawn beside the line of its path.
 SPACING, MARGIN, RADIUS, DSTATE, LANE = 130.0, 80.0, 17.0, 38.0, 9.0
+# The colours of the paths, in turn. The first six are of the palette of Okabe & Ito, which people who are colour-blind can tell apart.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b")
+# Characters of a view that are shown below a dstate: longer ones would run into the neighbours. The end is kept, as long names often begin alike.
 LONGEST_LABEL = 20
 QUARTERS = {"right": 1, "around": 2, "left": 3}
 AXES = ((0, -1), (1, 0), (0, 1), (-1, 0))  # up, right, down, left on the page
 
 
 def svg(ssh_map: SSHMap, turns: Mapping[str, str] | None = None) -> str:
-    """The map as SVG text. `turns` says which way an action of another name than right, left and around turns."""
+    """The map as SVG text.
+
+    turns  which way actions turn ("right", "left" or "around"), by name; actions of these three names need none
+    """
     if not ssh_map.places:
         return _page(*_causal(ssh_map))
     return _page(*_topological(ssh_map, layout(ssh_map, turns)))
 
 
 def layout(ssh_map: SSHMap, turns: Mapping[str, str] | None = None) -> dict[int, Point]:
-    """Where to draw each place, x to the right and y down."""
+    """Where to draw each place: x to the right and y down. `turns` as for `svg`."""
     turns = {name: name for name in QUARTERS} | dict(turns or {})
     return _right_angled(ssh_map, turns) or _spread(ssh_map)
 
@@ -44,7 +51,7 @@ def _right_angled(ssh_map: SSHMap, turns: Mapping[str, str]) -> dict[int, Point]
     if faces is None:
         return None
     coordinates: list[dict[int, int]] = []
-    for across in (1, 0):  # x: places on an upright path share a column; y: places on a level one share a row
+    for across in (1, 0):  # first x, where places on an upright path share a column; then y, where places on a level path share a row
         shared = nx.utils.UnionFind(ssh_map.places)
         for path in ssh_map.paths:
             if path.order and faces[path.id] % 2 != across:
@@ -67,7 +74,7 @@ def _right_angled(ssh_map: SSHMap, turns: Mapping[str, str]) -> dict[int, Point]
 
 
 def _faces(ssh_map: SSHMap, turns: Mapping[str, str]) -> dict[int, int] | None:
-    """Which way on the page (0 up, clockwise) direction +1 of each path faces, or None if the turns contradict each other."""
+    """Which way on the page direction +1 of each path faces (0 is up, then clockwise), or None if the turns contradict each other."""
     graph: nx.DiGraph[Any] = nx.DiGraph()
     graph.add_nodes_from(p.id for p in ssh_map.paths)
     for s, action, x in ssh_map.links:
@@ -89,7 +96,7 @@ def _faces(ssh_map: SSHMap, turns: Mapping[str, str]) -> dict[int, int] | None:
 
 
 def _runs_over(ssh_map: SSHMap, at: Mapping[int, Point]) -> bool:
-    """Whether a street would be drawn through a place that is not on it."""
+    """Whether a path would be drawn through a place that is not on it."""
     for path in ssh_map.paths:
         for (ax, ay), (bx, by) in pairwise(at[p] for p in path.order):
             for place in set(ssh_map.places) - set(path.order):
@@ -101,6 +108,7 @@ def _runs_over(ssh_map: SSHMap, at: Mapping[int, Point]) -> bool:
 
 
 def _spread(ssh_map: SSHMap) -> dict[int, Point]:
+    """Places so that neighbours on a path are near each other."""
     graph: nx.Graph[Any] = nx.Graph()
     graph.add_nodes_from(ssh_map.places)
     for path in ssh_map.paths:
@@ -109,7 +117,7 @@ def _spread(ssh_map: SSHMap) -> dict[int, Point]:
 
 
 def _layout(graph: nx.Graph[Any]) -> dict[int, Point]:
-    """Kamada-Kawai, scaled so that the nearest two nodes are a spacing apart."""
+    """The layout of Kamada & Kawai, scaled so that the two nearest nodes are SPACING apart. Parts that are not connected are joined first."""
     if len(graph) < 2:
         return dict.fromkeys(graph, (0.0, 0.0))
     connected = nx.Graph(graph)
@@ -146,7 +154,7 @@ def _topological(ssh_map: SSHMap, at: Mapping[int, Point]) -> tuple[list[str], l
 
 
 def _dstates(ssh_map: SSHMap, place: int, at: Mapping[int, Point]) -> list[str]:
-    """The dstates at a place, each on the side it faces; those along no path where there is room."""
+    """The dstates at a place, each on the side that it faces. Dstates along no path are drawn where there is most room."""
     x, y = at[place]
     taken: list[float] = []
     marks = []
@@ -155,7 +163,7 @@ def _dstates(ssh_map: SSHMap, place: int, at: Mapping[int, Point]) -> list[str]:
         bearing = _freest(taken) if faced is None else faced
         taken.append(bearing)
         dx, dy = math.cos(bearing), math.sin(bearing)
-        aside = (0.0, 0.0) if faced is None else (-dy * LANE, dx * LANE)  # on the right of the street
+        aside = (0.0, 0.0) if faced is None else (-dy * LANE, dx * LANE)  # drawn to the right of the line of the path
         colour = "#555" if s.path is None else COLOURS[s.path % len(COLOURS)]
         title = f"dstate {s.id}: {s.view}"
         px, py = x + dx * (RADIUS + 6) + aside[0], y + dy * (RADIUS + 6) + aside[1]
@@ -168,13 +176,13 @@ def _dstates(ssh_map: SSHMap, place: int, at: Mapping[int, Point]) -> list[str]:
 
 
 def _freest(taken: list[float]) -> float:
-    """The bearing that is farthest from those taken."""
+    """Of 16 bearings, the one that is farthest from those taken."""
     bearings = [k * math.pi / 8 for k in range(16)]
     return max(bearings, key=lambda b: min((abs(math.remainder(b - t, math.tau)) for t in taken), default=0.0))
 
 
 def _bearing(ssh_map: SSHMap, path: int | None, direction: int | None, place: int, at: Mapping[int, Point]) -> float | None:
-    """Which way on the page a dstate faces: to the next place of its path, or away from the last one."""
+    """Which way on the page a dstate faces: to the next place of its path or, at the end of the path, away from the place before. None if that is not known."""
     if path is None or direction is None:
         return None
     order = next(p.order for p in ssh_map.paths if p.id == path)[:: 1 if direction == 1 else -1]

@@ -5,7 +5,7 @@
 >>> len(trace), trace.views, [a.kind for a in trace.actions]
 (3, ('a', 'b', 'a'), ['travel', 'turn'])
 
-A file holds JSON lines: a header, then a line a step with what was seen and the action taken next. See docs/formats.md.
+A file holds JSON lines: a header, and then for each step a line with what was seen and the action taken next. See docs/formats.md.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ TurnDirection: TypeAlias = Literal["right", "left", "around"]
 Openings: TypeAlias = tuple[bool, bool, bool, bool]
 
 FORMAT, VERSION = "ssh-trace", 1
-LONGEST_LINE = 16 * 2**20  # bytes: a line with a panorama of 100,000 numbers fits, a file without line ends does not
+# Bytes that a line of a file may have. A step with a panorama of 100,000 numbers fits; a file that has no line ends is refused before it fills the memory.
+LONGEST_LINE = 16 * 2**20
 _KINDS = ("travel", "turn")
 _TURNS = ("right", "left", "around")
 _STEP_FIELDS = ("view", "image", "action", "star", "displacement", "truth")
@@ -41,7 +42,7 @@ _ACTION_FIELDS = ("name", "kind", "turn")
 class Action:
     """A sequence of control laws that takes the robot from one distinctive state to another.
 
-    `kind` and `turn` are what the topological axioms ask for; the causal ones ask for the name alone.
+    The topological axioms read `kind` and `turn`; the causal axioms read the name alone.
     """
 
     name: str
@@ -86,7 +87,7 @@ STANDARD_ACTIONS: dict[str, Action] = {
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What was seen at one moment, and the action taken next (None at the end of the trace).
+    """What was seen at one moment, and the action taken next (None on the last step of a trace).
 
     view          name or number of the view; None while only an image is there
     star          the openings ahead, right, back and left as four 0/1, or their bearings in degrees, clockwise from ahead
@@ -116,7 +117,7 @@ class Step:
 
     @property
     def openings(self) -> Openings | None:
-        """The star as (ahead, right, back, left). Bearings go to the nearest quarter; TraceError where two share one."""
+        """The star as (ahead, right, back, left). Each bearing counts as the nearest of these. Raises TraceError where two bearings share one."""
         star = self.star
         if star is None:
             return None
@@ -145,7 +146,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Trace:
-    """A sequence of steps: n + 1 observations with n actions between them. Immutable; made by `load` or `from_steps`."""
+    """A sequence of steps: n + 1 observations with n actions between them. It is immutable, and made by `load` or `from_steps`."""
 
     steps: tuple[Step, ...]
     name: str | None = None
@@ -211,7 +212,7 @@ class Trace:
         stars: Iterable[Sequence[float] | None] | None = None,
         name: str | None = None,
     ) -> Trace:
-        """A trace from n + 1 views, the n actions between them, and n + 1 stars if there are any. Raises TraceError."""
+        """A trace from n + 1 views, the n actions between them, and perhaps n + 1 stars. Raises TraceError."""
         seen, done = _listed(views, "views"), [Action.of(a) for a in _listed(actions, "actions")]
         if len(seen) != len(done) + 1:
             raise TraceError(
@@ -234,7 +235,7 @@ class Trace:
         return replace(self, steps=tuple(replace(step, star=None) for step in self.steps))
 
     def with_views(self, views: Iterable[View]) -> Trace:
-        """This trace with a view a step. Raises TraceError."""
+        """This trace with these views, one for each step. Raises TraceError."""
         seen = _listed(views, "views")
         if len(seen) != len(self):
             raise TraceError(f"views: expected {len(self)}, one a step, got {len(seen)}")
@@ -280,11 +281,11 @@ class Trace:
 
     @property
     def digest(self) -> str:
-        """A short digest of what the trace's file says, by which it is known again."""
+        """A short digest of the trace's file, by which a report can name the trace."""
         return hashlib.sha256("\n".join(self.to_lines()).encode("utf-8", "backslashreplace")).hexdigest()[:16]
 
     def to_lines(self) -> Iterator[str]:
-        """The lines of the trace's file: the header, then a line a step."""
+        """The lines of the trace's file: the header, and then a line for each step."""
         header = {"format": FORMAT, "version": VERSION, "name": self.name, "images": self.images}
         yield _dump({**{k: v for k, v in header.items() if v is not None}, **self.extra})
         for step in self.steps:
@@ -299,7 +300,11 @@ def _dump(value: Mapping[str, Any]) -> str:
 
 
 def _parse(file: BinaryIO, source: str, path: str) -> Trace:
-    """The trace in a file, which messages call `source`."""
+    """The trace in a file.
+
+    source  what messages call the file
+    path    what the trace remembers as its source
+    """
     header: dict[str, Any] | None = None
     steps: list[Step] = []
     actions: dict[str, Action] = {}
@@ -433,7 +438,7 @@ def _action(value: Any, where: str) -> Action:
         turn = name
     try:
         return Action(name, kind, turn, {k: v for k, v in value.items() if k not in _ACTION_FIELDS})  # type: ignore[arg-type]
-    except TraceError as error:  # the action knows its field, this knows its line
+    except TraceError as error:  # the message of the action names the field, and the file and line are put before it
         raise TraceError(f"{where.removesuffix('action')}{error}") from None
 
 
@@ -468,5 +473,5 @@ def _star(value: Any, where: str) -> tuple[float, ...]:
 
 
 def _is_quarters(star: tuple[float, ...]) -> bool:
-    """Four 0/1 are openings: as bearings two of them would be equal."""
+    """Whether a star is four 0/1, which are openings and not bearings: as bearings at least two of them would be equal."""
     return len(star) == 4 and all(x in (0, 1) for x in star)

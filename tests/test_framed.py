@@ -387,7 +387,7 @@ def test_what_is_not_told_beforehand_is_found() -> None:
     "theory", [Theory(star="frame"), Theory(star="frame", symmetric_sides=False), Theory(star="frame", boundary="none")]
 )
 def test_sides_and_streets_say_the_same(theory: Theory) -> None:
-    """sides.lp, of one street and visits that are one, against streets.lp, of all streets and settled dstates that may have none."""
+    """sides_framed.lp, of one path and visits that are one, against paths_framed.lp, of all paths and settled dstates that may have none."""
     contradicted = 0
     for seed in range(12):
         trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
@@ -408,12 +408,12 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
             return {tuple(x.number for x in atom.symbol.arguments) for atom in control.symbolic_atoms.by_signature(name, arity)}
 
         nodes = [(node, label, visit, slot) for node, (label, (visit, slot)) in enumerate(zip(labels, chart.facing, strict=True))]
-        beside, streets = atoms("beside", 3), atoms("street", 3)
+        beside, segments = atoms("beside", 3), atoms("on_segment", 3)
         pairs = {(i, j, (t - s - k) % 4) for _, x, i, s in nodes for _, y, j, t in nodes if i < j for k in range(4) if (x, y, k) in beside}
         for (dstate,) in atoms("along", 1):
             control = clingo.Control(["--warn=none"])
-            control.load(encodings.path("same"))
-            control.load(encodings.path("sides"))
+            control.load(encodings.path("visits"))
+            control.load(encodings.path("sides_framed"))
             given = [(node, visit, slot) for node, _, visit, slot in nodes]
             leaves = [(visit, *how) for visit, how in chart.leaves.items()]
             control.add("visits", [], facts.visit_facts(0, given, leaves, pairs))
@@ -424,7 +424,7 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
             control.ground([("visits", []), ("more", facts.numbers(0)), ("sides", []), ("streets", facts.numbers(0)), street])
             allowed = next(engine.asker.answers(lambda _: True, "ignore", 1, control=control), False)
             assert not (allowed and dstate in contrary)
-            assert allowed or {y for x, y, _ in streets if x == dstate} & set(contrary)
+            assert allowed or {y for x, y, _ in segments if x == dstate} & set(contrary)
     assert contradicted > 10
 
 

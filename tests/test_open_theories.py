@@ -13,6 +13,7 @@ import pytest
 from brute_force import Key, key, minimal_maps
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from instances import maze
 from strategies import TOYS, Toy, traces
 from worlds import ACTIONS
 
@@ -80,11 +81,23 @@ def test_a_rule_about_pairs_of_steps_on_circuits(steps: int, dstates: int) -> No
 
 
 @pytest.fixture
-def wider(tmp_path: Path) -> Iterator[type[Theory]]:
-    """A folder of encodings with one file more, and a theory with one field more: all that somebody does who adds an axiom, and forgets the rest."""
+def own_encodings(tmp_path: Path) -> Iterator[Path]:
+    """A copy of the encodings that a test may change, and that takes their place."""
     folder = tmp_path / "encodings"
     shutil.copytree(encodings.folder(), folder)
-    (folder / "forgetful.lp").write_text(
+    caches = (encodings.levels, encodings.axioms, encodings.paths, encodings.keeps)
+    for cached in caches:
+        cached.cache_clear()
+    with patch.object(encodings, "folder", lambda: folder):
+        yield folder
+    for cached in caches:
+        cached.cache_clear()
+
+
+@pytest.fixture
+def wider(own_encodings: Path) -> type[Theory]:
+    """A folder of encodings with one file more, and a theory with one field more: all that somebody does who adds an axiom, and forgets the rest."""
+    (own_encodings / "forgetful.lp").write_text(
         "% Toy.\n#program step(t).\n% @axiom(forgetful) No dstate is seen twice more than 10 steps apart. [a toy] if forgetful\n"
         "violation(forgetful,t) :- axiom(forgetful), same(I,t), t-I > 10.\n"
     )
@@ -93,13 +106,7 @@ def wider(tmp_path: Path) -> Iterator[type[Theory]]:
     class Wider(Theory):
         forgetful: bool = False
 
-    caches = (encodings.levels, encodings.axioms, encodings.keeps)
-    for cached in caches:
-        cached.cache_clear()
-    with patch.object(encodings, "folder", lambda: folder):
-        yield Wider
-    for cached in caches:
-        cached.cache_clear()
+    return Wider
 
 
 def test_an_axiom_put_into_the_encodings_and_the_theory_alone_is_obeyed(wider: type[Theory]) -> None:
@@ -114,6 +121,26 @@ def test_an_axiom_put_into_the_encodings_and_the_theory_alone_is_obeyed(wider: t
         mapper.observe(before, step.view)
     assert mapper.solution.cost
     assert mapper.solution.cost.dstates == 16
+
+
+@pytest.mark.parametrize(("speedup", "theory"), [("visits", Theory(star="frame")), ("ways", Theory(star="none"))])
+def test_what_a_shared_encoding_no_longer_keeps_switches_off_both_that_share_it(own_encodings: Path, speedup: str, theory: Theory) -> None:
+    assert row(speedup).holds_for(theory)
+    shared = own_encodings / "fast" / "paths.lp"
+    shared.write_text(shared.read_text().replace("path_order_total ", ""))
+    encodings.paths.cache_clear()
+    encodings.keeps.cache_clear()
+    assert not row(speedup).holds_for(theory)
+
+
+def test_a_file_of_the_working_directory_is_not_taken_for_an_encoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As clingo's own `#include` would."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "paths.lp").write_text(":- not never.")
+    (tmp_path / "fast").mkdir()
+    (tmp_path / "fast" / "paths.lp").write_text(":- not never.")
+    trace = maze(2, 2, steps=60, seed=1, stars=True).trace
+    assert solve(trace, Theory(star="frame")).status is Status.OPTIMAL
 
 
 def test_a_field_that_nothing_speaks_for_switches_off_what_is_exact_for_known_axioms() -> None:

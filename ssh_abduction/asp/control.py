@@ -18,14 +18,13 @@ from ssh_abduction.asp.limits import POLL, LimitError, Watch, peak_memory
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import Speedups
 
-PREPARING = (
-    0.6,
-    1.0,
-)  # of the time and of the memory that grounding took, clasp takes about so much before it begins to solve, and can be stopped
+# After grounding, clasp prepares the program before it begins to solve, and cannot be stopped meanwhile. That takes about this share of the time, and of the
+# memory, that grounding took; so a search is not begun where a limit would be over by then.
+PREPARING = 0.6, 1.0
 
 _ONE = clingo.Number(1)
 _grounding = threading.Lock()
-_under_way: set[clingo.SolveHandle] = set()  # searches of clingo's, each in a thread
+_under_way: set[clingo.SolveHandle] = set()  # the searches that clingo does now, each in a thread
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,14 +37,14 @@ class Grounding:
 
 @atexit.register
 def _end_all() -> None:
-    """At Python's end, end the searches of streams that somebody still holds: their threads would abort it."""
+    """When Python ends, end the searches of streams that somebody still holds, as their threads would abort Python."""
     for handle in list(_under_way):
         handle.cancel()
 
 
 @contextmanager
 def _held_back_interrupts() -> Iterator[None]:
-    """Ctrl-C waits until this is over: raised while clingo starts its thread, it would leave the thread without an owner."""
+    """Ctrl-C takes effect when this context ends. Raised while clingo starts a thread, it would leave the thread without an owner."""
     before = signal.getsignal(signal.SIGINT)
     if before is None or threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield
@@ -65,11 +64,14 @@ Made = TypeVar("Made")
 
 
 class Control(clingo.Control):
-    """A control without warnings. One at a time reads and grounds: side by side, threads wait for each other at each symbol, which takes three times as long.
+    """A clingo control without warnings.
 
-    check    called now and then while clingo grounds, where an encoding has `@go_on`; what it raises ends that, and the control is of no use then
-    preparing  how much of the time and of the memory that grounding took clasp takes before it begins to solve, about
-    seconds  that clingo grounded since it last began to solve, and by how many MiB the process has grown meanwhile
+    Only one control at a time reads or grounds: two threads that do so side by side wait for each other at each symbol, which takes three times as long.
+
+    check      called now and then while clingo grounds, where an encoding has `@go_on`; what it raises ends the grounding, and the control is of no use then
+    preparing  see PREPARING
+    seconds    that clingo has grounded since it last began to solve
+    mebibytes  by which the process has grown meanwhile
     """
 
     def __init__(
@@ -84,6 +86,12 @@ class Control(clingo.Control):
         with _grounding:
             super().load(path)
 
+    def load_encodings(self, *names: str) -> None:
+        """Load these encodings, with the files that they share with others."""
+        for name in names:
+            for path in encodings.paths(name):
+                self.load(path)
+
     def add(self, *program: Any) -> None:
         with _grounding:
             super().add(*program)
@@ -96,7 +104,7 @@ class Control(clingo.Control):
         try:
             super().ground(parts, context or asked)
         except BaseException:
-            if asked.raised is not None:  # clingo raises another one of this type, made from this one
+            if asked.raised is not None:  # clingo raises a copy of this exception, which lacks what it holds
                 raise asked.raised from None
             raise
         finally:
@@ -106,7 +114,7 @@ class Control(clingo.Control):
 
 
 class _Asked:
-    """What clingo asks while it grounds: whether to go on."""
+    """Answers what clingo asks while it grounds (`@go_on`): whether to go on."""
 
     def __init__(self, check: Callable[[], None]) -> None:
         self.raised: BaseException | None = None
@@ -114,7 +122,7 @@ class _Asked:
         self._next = time.perf_counter() + POLL
 
     def go_on(self, *_: clingo.Symbol) -> clingo.Symbol:
-        """1, unless `check` raises. That is called seldom, as clingo may ask this millions of times."""
+        """1, unless `check` raises. `check` is called only now and then, as clingo may ask this millions of times."""
         try:
             if time.perf_counter() > self._next:
                 self._check()
@@ -128,9 +136,9 @@ class _Asked:
 class Asker:
     """One clingo control, and the questions to it under limits. What asks clingo has one of these.
 
-    control  a new one may take its place
+    control  the control that is asked; a new one may take its place
     watch    the limits; another search may go on under others
-    ground_seconds, solve_seconds  that clingo took so far
+    ground_seconds, solve_seconds  the time that clingo took so far
     """
 
     def __init__(self, watch: Watch) -> None:
@@ -150,7 +158,7 @@ class Asker:
 
     @property
     def grounding(self) -> Grounding:
-        """The size of the program of clingo's last call that came to an end. Takes a millisecond, as clingo tells all it counts."""
+        """The size of the program in the last call of clingo that came to an end. To ask takes a millisecond, as clingo tells all that it counts."""
         try:
             program = self.control.statistics["problem"]["lp"]
         except (RuntimeError, KeyError):  # no call came to an end
@@ -170,9 +178,16 @@ class Asker:
         until: Callable[[], bool] = lambda: False,
         ahead: bool = False,
     ) -> Generator[Answer, None, bool]:
-        """What clingo answers, read at once. Returns whether it came to an end, and not to the limit of conflicts, or to where `until` holds.
+        """The answers of clingo, each read as soon as it comes. Returns whether these are all, and neither the limit of conflicts nor `until` ended the search.
 
-        ahead  let clingo search for the next answer while something is made of this one
+        read       makes a value of an answer, which clingo may change afterwards
+        mode       how clingo optimises: its option opt-mode
+        models     how many answers are asked for, 0 for all
+        conflicts  the limit, -1 for none
+        on_bound   called with each bound that clingo proves
+        control    another control than this one's own
+        until      asked now and then; where it is true, the search ends
+        ahead      let clingo search for the next answer while the caller uses this one
         """
         project = "project" if not mode.startswith("opt") else "no"
         with self._solving(control or self.control, assumptions, mode, models, project, conflicts, on_bound) as handle:
@@ -198,7 +213,7 @@ class Asker:
         mode: str = "ignore",
         until: Callable[[], bool] = lambda: False,
     ) -> tuple[Answer | None, list[int] | None]:
-        """An answer that these literals are true in, or else a core of them; neither where the limit of conflicts was reached, or `until` holds."""
+        """An answer in which these literals are true, or else a core of them. Neither, where the limit of conflicts or `until` ended the search."""
         with self._solving(self.control, assumed, mode, 1, "no", conflicts) as handle:
             if not self._has_come(handle, until):
                 return None, None
@@ -208,7 +223,9 @@ class Asker:
             if not _result(handle, conflicts).unsatisfiable:
                 return None, None
             known = set(assumed)
-            return None, [literal for literal in handle.core() if literal in known]  # external atoms are assumed, too
+            return None, [
+                literal for literal in handle.core() if literal in known
+            ]  # a core may also have external atoms, which clingo assumes
 
     @contextmanager
     def _solving(
@@ -221,7 +238,7 @@ class Asker:
         conflicts: int,
         on_bound: Callable[[Sequence[int]], None] | None = None,
     ) -> Iterator[clingo.SolveHandle]:
-        """A search of clingo's in its own thread. It ends with this."""
+        """A search of clingo in a thread of its own, which ends with this context."""
         configuration: Any = control.configuration.solve
         configuration.opt_mode, configuration.models, configuration.project = mode, models, project
         configuration.solve_limit = f"{conflicts},-1"
@@ -241,7 +258,7 @@ class Asker:
                 handle.cancel()
 
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
-        """Wait until clingo has come to an answer or an end; or until `until` holds, and then False."""
+        """Wait until clingo has come to an answer or to an end, and return True; or until `until` holds, and return False."""
         began = time.perf_counter()
         try:
             while not handle.wait(POLL):
@@ -255,7 +272,7 @@ class Asker:
 
 
 def mapped(function: Callable[[Answer], Made], answers: Generator[Answer, None, bool]) -> Generator[Made, None, bool]:
-    """What a function makes of each answer. Returns what these return."""
+    """The results of a function for each answer. Returns what the generator of the answers returns."""
     with closing(answers):
         while True:
             try:
@@ -266,7 +283,7 @@ def mapped(function: Callable[[Answer], Made], answers: Generator[Answer, None, 
 
 
 def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
-    """How a search ended. Raises LimitError if something else than the limit of conflicts ended it."""
+    """How a search ended. Raises LimitError if it was interrupted from outside, and not ended by the limit of conflicts."""
     result = handle.get()
     if result.interrupted and conflicts < 0:
         raise LimitError("interrupted")
@@ -276,14 +293,14 @@ def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
 def new_control(encoding: str, base: str, options: Sequence[str], speedups: Speedups) -> Control:
     """A control with an encoding, and these facts in its base."""
     control = Control(options)
-    control.load(encodings.path(encoding))
+    control.load_encodings(encoding)
     control.add("base", [], base if speedups.watched else f"{base}\n{facts.watched()}.")
     control.ground([("base", [])])
     return control
 
 
 def give_threads(control: clingo.Control, *, two: bool) -> None:
-    """Let clasp search with two threads, which tell each other what they learn, or with one."""
+    """Let clasp search with two threads, which exchange what they learn, or with one."""
     configuration: Any = control.configuration.solve
     configuration.parallel_mode = "2,compete" if two else "1"
 

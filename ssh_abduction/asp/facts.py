@@ -1,8 +1,7 @@
 """Between Python and clingo: a trace becomes facts, an answer set becomes a map. No other module knows a predicate's name.
 
-What is told of many steps is told at once: the step is an argument of a fact, and one call grounds the rules for all of them. A part of the
-program for each step makes the same rules cost about thirty times as much to ground, so only the readable encodings, which are mostly
-grounded for short prefixes, have such parts.
+In the fast encodings a step is an argument of a fact, so that one call grounds the rules for many steps. A program part for each step would make the
+same rules take about thirty times as long to ground. Only the readable encodings, which are mostly grounded for short prefixes, have such parts.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from ssh_abduction.trace import Action, Trace
 
 _COURSE = {"pos": 1, "neg": -1}
 
-_Ahead: TypeAlias = tuple[int, int, int]  # a path, and two places of which the first is before the other
+_Ahead: TypeAlias = tuple[int, int, int]  # a path, and two places of which the first comes before the second on it
 
 
 def encoding_names(theory: Theory) -> tuple[str, ...]:
@@ -43,6 +42,7 @@ def theory_facts(theory: Theory, paths: int) -> str:
 
 
 def _preferred(theory: Theory) -> list[str]:
+    """Which counts a theory prefers to be small, the first one at the highest level."""
     return [f"prefer({count},{len(theory.priorities) - i})." for i, count in enumerate(theory.priorities)]
 
 
@@ -126,7 +126,7 @@ def _kind_fact(action: Action) -> str:
 
 @lru_cache(maxsize=2**14)
 def _atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
-    """The name and the arguments of an atom of a map. Kept, as maps have most atoms in common, and each part is a call to clingo."""
+    """The name and the arguments of an atom of a map. They are cached, as maps have most atoms in common and each part takes a call to clingo."""
     return symbol.name, tuple(arg.number if arg.type is SymbolType.Number else _COURSE[arg.name] for arg in symbol.arguments)
 
 
@@ -198,10 +198,13 @@ def name_facts(
     choices: Sequence[Sequence[int]],
     ordered: bool = True,
 ) -> str:
-    """Names with their views; for each view its spare names, the last for the rest; and where an action at a name can lead.
+    """The facts of names.lp that hold for all batches.
 
-    choices  of each node, the names that it can be at
-    ordered  whether steps are at spare names in the order of the names; if not, that may be assumed
+    names    each with its view
+    spares   for each view its spare names; the last one is the rest
+    links    of the nodes, with their actions
+    choices  for each node, the names that it can be at
+    ordered  whether steps have to be at spare names in the order of the names; if not, that may be assumed in a question
     """
     view_of = dict(names)
     rests = {spare[-1] for spare in spares}
@@ -221,7 +224,12 @@ def batch_facts(
     links: Iterable[tuple[int, int, int]],
     apart: Iterable[tuple[int, int]],
 ) -> str:
-    """Nodes, each with its view, the names it can be at, and the node of that view before it; links with their actions; and pairs that are apart."""
+    """The facts of names.lp for one batch.
+
+    nodes  each with its view, the names that it can be at, and the node of that view that was given before it
+    links  with their actions
+    apart  pairs of nodes
+    """
     facts = []
     for t, view, names, before in nodes:
         facts.append(f"node({batch},{t},{view}).")
@@ -233,12 +241,12 @@ def batch_facts(
 
 
 def watched() -> Symbol:
-    """The external atom that makes constraints of three literals longer, so that clasp watches them."""
+    """The external atom that makes constraints of three literals longer, so that clasp looks at two of their literals only."""
     return Function("watched")
 
 
 def resting(batch: int) -> Symbol:
-    """The atom that holds if a step of the batches up to this one is at the rest of its view. Assumed by who asks for such a map."""
+    """The atom that some step of the batches up to this one is at the rest of its view. It is assumed, or assumed false, in a question."""
     return Function("resting", numbers(batch))
 
 
@@ -264,24 +272,26 @@ def read_names(model: Model) -> dict[int, int]:
 
 @lru_cache(maxsize=2**16)
 def _named(symbol: Symbol) -> tuple[int, int]:
-    """A step and its name. Kept, as answers that follow each other have most atoms in common, and each part is a call to clingo."""
+    """A step and its name. They are cached, as successive answers have most atoms in common and each part takes a call to clingo."""
     step, name = symbol.arguments
     return step.number, name.number
 
 
 class NameReader:
-    """Reads answers of names.lp to which all links of a trace are given: where actions lead tells the name of each step, and takes less time to ask for.
+    """Reads answers of names.lp that was given all links of a trace. The name of each step then follows from where actions lead, which takes fewer questions.
 
     actions  after each step but the last, as numbers
-    choices  of each step, the names that it can be at
-    rests    the names for a rest
+    choices  for each step, the names that it can be at
+    rests    the names that are rests
     """
 
     def __init__(self, actions: Sequence[int], choices: Sequence[Sequence[int]], rests: Collection[int]) -> None:
         self._actions = actions
         self._choices = choices
         self._rests = rests
-        self._last: dict[tuple[int, int], tuple[int, int]] = {}  # where an action at a name led last, and the literal of that
+        self._last: dict[
+            tuple[int, int], tuple[int, int]
+        ] = {}  # where an action at a name led in the last answer, and the literal that says so
 
     def read(self, model: Model) -> dict[int, int]:
         """The name of each step."""
@@ -311,39 +321,45 @@ def visit_facts(
     fits: Iterable[tuple[int, int, int]],
     unfit: Iterable[tuple[int, int, int]] = (),
 ) -> str:
-    """What is new of visits: numbered nodes with visit and slot, where visits end and how, which pairs may be one, and which no longer."""
+    """The facts of visits.lp for one batch: what is new of visits.
+
+    nodes   number, visit and slot of each
+    leaves  visits that end: the visit, the slot and the action
+    fits    pairs of visits that may be at one place, and how turned
+    unfit   such pairs of earlier batches that may no longer be
+    """
     new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit}
     return "\n".join(f"{name}({batch},{','.join(map(str, args))})." for name, rows in new.items() for args in rows)
 
 
 def same(pair: tuple[int, int, int]) -> Symbol:
-    """The atom that two visits are the same, so turned."""
+    """The atom that two visits are at one place, and how they are turned to each other."""
     return Function("same", numbers(*pair))
 
 
 def read_same(atom: Symbol) -> tuple[int, int, int]:
-    """The two visits, and how turned, of such an atom."""
+    """The two visits of such an atom, and how they are turned to each other."""
     first, second, turned = (argument.number for argument in atom.arguments)
     return first, second, turned
 
 
 def listed(batch: int) -> Symbol:
-    """The external atom that answers for the batches up to this one are listed."""
+    """The external atom that is true while answers for the batches up to this one are listed."""
     return Function("listed", numbers(batch))
 
 
 def alone(place: int) -> Symbol:
-    """The atom that the node at this place of the order is the first at its dstate."""
-    return Function("alone", numbers(place))
+    """The atom that the node at this position of the order is the first at its dstate."""
+    return Function("first", numbers(place))
 
 
 def over(core: int, count: int) -> Symbol:
-    """The atom that so many members of a core are there."""
+    """The atom that at least so many members of a core are true."""
     return Function("over", numbers(core, count))
 
 
 def read_over(member: Symbol) -> tuple[int, int] | None:
-    """The core and the count of such an atom; None for another."""
+    """The core and the count of such an atom; None for another atom."""
     return (member.arguments[0].number, member.arguments[1].number) if member.name == "over" else None
 
 
@@ -353,14 +369,17 @@ def core_facts(core: int, members: Iterable[Symbol]) -> str:
 
 
 def three_facts(batch: int, threes: Iterable[tuple[int, ...]]) -> str:
-    """Visits of which it matters that to be the same is transitive."""
+    """Threes of visits for which clingo is to keep that to be at one place is transitive."""
     return "\n".join(f"via({batch},{','.join(map(str, three))})." for three in threes)
 
 
 def forbidden_pairs(
     pairs: Iterable[tuple[int, int, int]], different: Iterable[tuple[int, int, int]] = (), listed: int | None = None
 ) -> str:
-    """The rule that these pairs of visits are not all the same while those are not; only while answers up to a batch are listed, if given."""
+    """The rule that not all of these pairs of visits are at one place while all those `different` ones are not.
+
+    listed  the rule holds only while answers up to this batch are listed (default always)
+    """
     body = [*(f"same({i},{j},{r})" for i, j, r in pairs), *(f"not same({i},{j},{r})" for i, j, r in different)]
     return f":- {', '.join(['#true', *body] if listed is None else [f'listed({listed})', *body])}."
 
@@ -372,12 +391,15 @@ def forbidden_equalities(equalities: Iterable[Equality]) -> str:
 
 
 def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
-    """The rule that these pairs of steps with names are not all one dstate. At a rest steps need not be one."""
+    """The rule that these pairs of steps with names are not all one dstate. At a rest steps need not be one.
+
+    number  another one for each such rule
+    """
     together = [f"together({number},{k}) :- is({i},S), is({j},S), not rest(S)." for k, (i, j) in enumerate(pairs)]
     return "\n".join([*together, f":- {', '.join(f'together({number},{k})' for k in range(len(pairs)))}."])
 
 
-_number = cache(Number)  # half the time of a symbol, where there are many
+_number = cache(Number)  # takes half the time of making a number anew, where there are many
 
 
 def numbers(*arguments: int) -> list[Symbol]:
@@ -397,13 +419,13 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
 
 
 def street_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
-    """What happened at the nodes of a chart, as facts for streets.lp."""
-    facts = [f"turned({s},{x},{-action})." for s, action, x in chart.links if action < 0]
-    facts += [f"travel({s},{x})." for s, _, x in chart.travels]
-    facts += [f"around({s},{x})." if turn == "around" else f"bend({s},{turn},{x})." for s, turn, x in chart.turns(trace)]
-    facts += [f"unlike({s},{x})." for s, x in chart.excluded]
+    """What happened at the nodes of a chart, as facts for paths_framed.lp."""
+    facts = [f"rotated({s},{x},{-action})." for s, action, x in chart.links if action < 0]
+    facts += [f"travelled({s},{x})." for s, _, x in chart.travels]
+    facts += [f"turned({s},{turn},{x})." for s, turn, x in chart.turns(trace)]
+    facts += [f"excluded({s},{x})." for s, x in chart.excluded]
     visits = {(chart.facing[s][0], chart.facing[x][0]): (s, x) for s, x in chart.away}
-    facts += [f"away({s},{x})." for s, x in visits.values()]
+    facts += [f"far_nodes({s},{x})." for s, x in visits.values()]
     return "\n".join([*facts, side_facts(theory)])
 
 
@@ -415,7 +437,7 @@ def side_facts(theory: Theory) -> str:
 
 
 def way_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
-    """Which numbered actions are travels and turns, and which axioms of sides hold, as facts for ways.lp."""
+    """Which numbered actions are travels and turns, and which axioms of sides hold, as facts for sides_frameless.lp."""
     kinds = [f"turns({a},{action.turn})." if action.turn else f"travels({a})." for a, action in actions.items()]
     return "\n".join([*kinds, side_facts(theory)])
 
@@ -429,7 +451,11 @@ def course_facts(
     *,
     single: bool = False,
 ) -> str:
-    """Dstates, the numbered actions that link them, and what is preferred, as facts for courses.lp; or for single courses."""
+    """Dstates, the numbered actions that link them, and what is preferred, as facts for paths_frameless.lp.
+
+    far     pairs of dstates that evidence says are not at one place
+    single  ask only for places and paths in which no two places and no two segments are one, unless they have to be
+    """
     facts = [side_facts(theory), *(["total."] if theory.path_order == "total" else []), *(["single."] if single else [])]
     facts += [f"is({x})." for x in dstates]
     facts += [f"far({x},{y})." for x, y in far]
@@ -438,7 +464,7 @@ def course_facts(
 
 
 def turn_facts(batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]) -> str:
-    """New visits, and new turns on a visit, from slot to slot, as facts for sides.lp."""
+    """New visits, and new turns on a visit, from slot to slot, as facts for sides_framed.lp."""
     facts = [f"visit({batch},{visit})." for visit in visits]
     for s, turn, x in turns:
         (visit, slot), (_, faced) = chart.facing[s], chart.facing[x]
@@ -447,16 +473,21 @@ def turn_facts(batch: int, chart: FramedChart, visits: Iterable[int], turns: Ite
 
 
 def read_contrary(model: Model) -> tuple[list[int], list[int]]:
-    """Dstates whose streets show that they have none, shortest streets first; and dstates where streets cross that meet again."""
+    """Dstates whose segments show that there are no places and paths, those of short segments first; and dstates where paths cross that seem to meet again."""
     atoms = list(map(_atom, model.symbols(shown=True)))
     contrary = sorted((args[1], args[0]) for name, args in atoms if name == "contrary")
     return [dstate for _, dstate in contrary], sorted(args[0] for name, args in atoms if name == "twice")
 
 
 def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int], *, single: bool = False) -> str:
-    """The dstates of these nodes, what is open from dstates, and what is preferred, as facts for the least streets; or for single ones."""
+    """The dstates of these nodes, what is open from each dstate, and what is preferred, as facts for the fewest places and paths (paths_framed.lp).
+
+    single  ask only for places and paths in which no two places and no two segments are one, unless they have to be
+    """
     facts = [settled_labels((node, labels[node]) for node in nodes), *(["single."] if single else [])]
-    for label, node in {label: node for node, label in enumerate(labels)}.items():  # any node of a dstate sees the same star
+    for label, node in {
+        label: node for node, label in enumerate(labels)
+    }.items():  # all nodes of a dstate see one star, so any of them will do
         visit, slot = chart.facing[node]
         star = chart.stars[visit]
         facts += [f"open({label},{k})." for k in range(4) if star[(slot + k) % 4]]
@@ -464,19 +495,19 @@ def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nod
 
 
 def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
-    """The stretches of streets.lp, and pairs of them that cannot be one path, in neither direction."""
-    stretches = sorted(_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("stretch", 1))
-    rivals = {tuple(_atom(atom.symbol)[1]) for atom in control.symbolic_atoms.by_signature("rival", 3)}
-    return stretches, [(g, h) for g, h, direction in rivals if direction == 1 and (g, h, -1) in rivals]
+    """The segments of paths_framed.lp, and the pairs of them that cannot be one path in either direction."""
+    segments = sorted(_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("segment", 1))
+    distinct = {tuple(_atom(atom.symbol)[1]) for atom in control.symbolic_atoms.by_signature("distinct", 3)}
+    return segments, [(g, h) for g, h, direction in distinct if direction == 1 and (g, h, -1) in distinct]
 
 
-def pinned_facts(stretches: Iterable[int]) -> str:
-    """Stretches no two of which can be one path, as facts for streets.lp."""
-    return " ".join(f"pinned({stretch})." for stretch in stretches)
+def pinned_facts(segments: Iterable[int]) -> str:
+    """Segments no two of which can be one path, as facts for paths_framed.lp."""
+    return " ".join(f"pinned({segment})." for segment in segments)
 
 
 def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int, int]]]:
-    """Whether the labels of nodes are violated, and else which pairs of dstates are at different places, and which are one."""
+    """Whether the labels of nodes have no places and paths; and if not so, which pairs of dstates are at different places, and which are one."""
     found: dict[str, list[tuple[int, int]]] = {"elsewhere": [], "one": []}
     for name, args in map(_atom, model.symbols(shown=True)):
         if name == "violated":
@@ -486,7 +517,7 @@ def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int
 
 
 def is_violated(control: Control) -> bool:
-    """Whether no streets fit the labels of nodes, where that takes no choice to see."""
+    """Whether no places and paths fit the labels of nodes, as far as that can be seen without a choice."""
     return control.symbolic_atoms[Function("violated")] is not None
 
 
@@ -501,7 +532,7 @@ def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """The dstate of each node, for clingo to take or leave, as long as something is violated."""
+    """The dstate of each node, for clingo to take or to leave out, so that what it takes has no places and paths."""
     return "\n".join([*(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)), ":- not violated.", "#show is/2."])
 
 
@@ -511,17 +542,17 @@ def read_contraries(model: Model) -> list[int]:
 
 
 def forbidden_links(links: Iterable[tuple[int, int, int]], placed: Iterable[tuple[int, int]] = ()) -> str:
-    """The rule that these links of named dstates do not go together while these steps are at these dstates."""
+    """The rule that these links of named dstates do not all hold while these steps are at these dstates."""
     return f":- {', '.join([*(f'goes({s},{a},{x})' for s, a, x in links), *(f'is({t},{s})' for t, s in placed)])}."
 
 
 @dataclass(frozen=True, slots=True)
 class StreetAnswer:
-    """An answer of streets.lp or courses.lp.
+    """An answer of paths_framed.lp or paths_frameless.lp.
 
-    at     of each place that the turns tell, the place that it is at, and how it is turned to it
-    part   of each stretch, the path that it is part of, and in which direction
-    order  of each path, its places
+    at     for each place that the turns tell, the place that it is at, and how it is turned to it
+    part   for each segment, the path that it is part of, and in which direction
+    order  for each path, its places in order
     """
 
     at: dict[int, tuple[int, int]]
@@ -530,46 +561,47 @@ class StreetAnswer:
 
 
 class StreetReader:
-    """Reads the maps of one labelling of nodes from answers of streets.lp or courses.lp; what the labels alone tell is worked out once.
+    """Reads maps from answers of paths_framed.lp or paths_frameless.lp, for one labelling of the nodes. What the labels alone tell is worked out once.
 
-    An answer is asked for atoms that it may hold, those of the last one first: that takes a third of the time that it takes to read all it holds.
+    Instead of reading all atoms of an answer, this asks it for the atoms that can be in it, beginning with those of the answer before. That takes a third of
+    the time.
     """
 
     def __init__(self, control: Control, trace: Trace, theory: Theory, chart: Chart, labels: Sequence[int]) -> None:
         stands, runs = ({a: (b, c) for a, b, c in _literals(control, name)} for name in ("stands", "runs"))
-        first: dict[int, int] = {}  # step at a dstate, by its label
+        first: dict[int, int] = {}  # for each label, the first step at its dstate
         for t, node in enumerate(chart.node_of):
             first.setdefault(labels[node], t)
         number = {label: i for i, label in enumerate(first)}
         self._labels = tuple(number[labels[node]] for node in chart.node_of)
         self._links = links_of(self._labels, trace)
         self._dstates = [(_view(trace, t), *stands[label]) for label, t in first.items()]
-        self._runs: dict[int, list[tuple[int, int]]] = {}  # of each stretch, the dstates on it, and whether they face its direction
+        self._runs: dict[int, list[tuple[int, int]]] = {}  # for each segment, the dstates on it, and whether they face its direction
         for i, label in enumerate(first):
             if label in runs:
-                stretch, direction = runs[label]
-                self._runs.setdefault(stretch, []).append((i, direction))
-        self._passes = {(stretch, self._dstates[i][1]): None for stretch, members in self._runs.items() for i, _ in members}
+                segment, direction = runs[label]
+                self._runs.setdefault(segment, []).append((i, direction))
+        self._passes = {(segment, self._dstates[i][1]): None for segment, members in self._runs.items() for i, _ in members}
         self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
         self._total = theory.path_order == "total"
-        self._before: dict[_Ahead, int] = {}  # literals, 0 for what is never so
-        self._order: dict[int, list[int]] = {}  # of each path, its places when they were last asked for
-        self._placed: _Placed | None = None  # of the last map: places are mostly as in that
-        self._made: dict[tuple[object, ...], DState] = {}  # most dstates are the same in most maps
+        self._before: dict[_Ahead, int] = {}  # the literal that says so, 0 for what is never so
+        self._order: dict[int, list[int]] = {}  # for each path, its places in the answer that was read last
+        self._placed: _Placed | None = None  # what the places of the last map tell, as they are mostly the same in the next
+        self._made: dict[tuple[object, ...], DState] = {}  # dstates made so far, as most of them are in most maps
 
     def read(self, model: Model) -> StreetAnswer:
-        """What an answer holds."""
+        """The values that map_of needs of an answer."""
         at, part = self._at.made_in(model), self._part.made_in(model)
-        on: dict[int, dict[int, None]] = {}  # of each path, the places on it
-        for stretch, component in self._passes:
-            on.setdefault(part[stretch][0], {})[at[component][0]] = None
+        on: dict[int, dict[int, None]] = {}  # for each path, the places on it
+        for segment, component in self._passes:
+            on.setdefault(part[segment][0], {})[at[component][0]] = None
         return StreetAnswer(at, part, {path: self._ordered(model, path, places) for path, places in on.items()})
 
     def _ordered(self, model: Model, path: int, places: Collection[int]) -> list[int]:
-        """The places of a path in order: mostly near that of the last answer."""
+        """The places of a path in order. This begins with their order in the last answer, which is mostly nearly the same."""
         order = list(dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places]))
         if self._total:
-            for i, place in enumerate(order):  # by insertion
+            for i, place in enumerate(order):  # insertion sort takes few questions where places are nearly in order
                 to = i
                 while to and not self._is_before(model, (path, order[to - 1], place)):
                     to -= 1
@@ -587,16 +619,16 @@ class StreetReader:
         return literal != 0 and model.is_true(literal)
 
     def map_of(self, answer: StreetAnswer) -> SSHMap:
-        """The map that it describes."""
+        """The map that an answer describes."""
         placed = self._placed
         if placed is None or placed.at != answer.at:
             placed = self._placed = self._placed_at(answer.at)
-        faced: dict[int, tuple[int, int]] = {}  # of each path, its number and the direction that is faced first
+        faced: dict[int, tuple[int, int]] = {}  # for each path, its number in the map, and the direction that is faced first
         dstates = list(placed.dstates)
-        for stretch, members in self._runs.items():
-            h, ahead = answer.part[stretch]
+        for segment, members in self._runs.items():
+            h, ahead = answer.part[segment]
             path, first = faced.setdefault(h, (len(faced), ahead * members[0][1]))
-            key = stretch, path, ahead * first
+            key = segment, path, ahead * first
             along = placed.along.get(key)
             if along is None:
                 along = placed.along[key] = [(i, self._dstate(dstates[i], path, key[2] * direction)) for i, direction in members]
@@ -607,8 +639,8 @@ class StreetReader:
         return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(placed.number))), paths)
 
     def _placed_at(self, at: dict[int, tuple[int, int]]) -> _Placed:
-        """What places tell."""
-        arrived: dict[int, tuple[int, int]] = {}  # of each place, its number and the slot that is faced first
+        """What the places of an answer tell of a map."""
+        arrived: dict[int, tuple[int, int]] = {}  # for each place, its number in the map, and the slot that is faced first
         dstates: list[DState] = []
         for view, component, slot in self._dstates:
             p, turned = at[component]
@@ -617,7 +649,7 @@ class StreetReader:
         return _Placed(at, {p: number for p, (number, _) in arrived.items()}, dstates, {})
 
     def _dstate(self, placed: DState, path: int, direction: int) -> DState:
-        """A dstate on a path."""
+        """A dstate, with its path and direction."""
         key = placed.id, placed.place, placed.heading, path, direction
         if key not in self._made:
             self._made[key] = replace(placed, path=path, direction=direction)
@@ -629,9 +661,9 @@ class _Placed:
     """What the places of an answer tell of a map.
 
     at       as in StreetAnswer
-    number   of each place
-    dstates  without paths
-    along    those on a stretch, by the stretch, the path that it is part of, and in which direction
+    number   for each place, its number in the map
+    dstates  the dstates of the map, without paths
+    along    the dstates of a segment with their paths, by the segment, the path that it is part of, and in which direction
     """
 
     at: dict[int, tuple[int, int]]
@@ -641,17 +673,19 @@ class _Placed:
 
 
 class _Choices:
-    """The atoms of which an answer holds one for each first argument."""
+    """The atoms of a predicate with three arguments of which an answer has exactly one for each first argument."""
 
     def __init__(self, control: Control, name: str) -> None:
-        self._among: dict[int, list[tuple[int, tuple[int, int]]]] = {}  # literals, and what they say
+        self._among: dict[
+            int, list[tuple[int, tuple[int, int]]]
+        ] = {}  # for each first argument, the literals of its atoms, and their other arguments
         for (a, b, c), literal in _literals(control, name).items():
             self._among.setdefault(a, []).append((literal, (b, c)))
 
     def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
-        """What an answer says of each first argument."""
+        """The other two arguments that an answer chooses for each first argument."""
         made = {}
-        for a, among in self._among.items():
+        for a, among in self._among.items():  # what the last answer chose is asked for first
             if len(among) > 1 and not model.is_true(among[0][0]):
                 taken = next(i for i, (literal, _) in enumerate(among) if model.is_true(literal))
                 among.insert(0, among.pop(taken))
@@ -660,7 +694,7 @@ class _Choices:
 
 
 def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
-    """The literals of atoms with three arguments, by these."""
+    """The literals of the atoms of a predicate with three arguments, by these."""
     found = {}
     for atom in control.symbolic_atoms.by_signature(name, 3):
         a, b, c = _atom(atom.symbol)[1]
@@ -693,7 +727,7 @@ def _paths(count: int, dstates: Iterable[DState], before: Iterable[tuple[int, in
 
 
 def _in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:
-    """Places, each behind the ones that are before it: in a strict order it has more of those than they have."""
+    """Places in an order in which each comes behind all that are before it. In a strict order, a place has more places before it than each of these has."""
     behind = dict.fromkeys(places, 0)
     for _, q in before:
         behind[q] += 1

@@ -9,9 +9,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Literal, TypeAlias
 
-RESERVE = 0.2  # share of the time limit kept for finding any map of the whole trace
-POLL = 0.05  # seconds between looks at the clock and for Ctrl-C
-TICK = 0.5  # seconds between reports of progress while clingo is busy
+# The search for minimal maps of prefixes ends when this share of the time limit is left. Until then it may have no map of the whole trace, and the rest of the
+# time is for finding one, minimal or not.
+RESERVE = 0.2
+# Seconds between two looks at the clock and at Ctrl-C while clingo is busy: short against the second by which a limit may be overrun, and long against the time
+# that a look takes.
+POLL = 0.05
+# Seconds between two reports of progress: as often as somebody can read them.
+TICK = 0.5
 
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
 
@@ -28,12 +33,13 @@ class StageTimeError(Exception):
 
 
 class Watch:
-    """The limits of a search: `check` raises when one is over. Time that the caller of a stream takes does not count.
+    """The limits of a search: `check` raises when one is over. Time that the caller of a stream takes between two maps does not count.
 
     limit    seconds, or None
     memory   MiB that the process may use, or None
-    on_tick  called now and then
-    beside  the watch of the search that this one is beside: that one ends it, and what cannot be interrupted is not begun where too little time is left
+    on_tick  called now and then, to report progress
+    beside   the watch of another search, where this one runs beside it in a thread or process. The other search ends this one, so its time limit only keeps
+             this one from beginning what cannot be interrupted and would take longer
     """
 
     def __init__(
@@ -74,7 +80,7 @@ class Watch:
         self._spent, self._started = self.elapsed(), None
 
     def part(self, seconds: float) -> Watch:
-        """A watch, started, for so many seconds of this one's time, which is looked at now and then."""
+        """A watch that allows so many seconds from now, and ends earlier where this one does."""
         part = Watch(seconds, self._memory, self.check)
         part.use_reserve()
         part.start()
@@ -92,7 +98,11 @@ class Watch:
         return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
 
     def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
-        """Raise if a limit is over, or would be after what cannot be interrupted and takes so many seconds, and so much memory."""
+        """Raise if a limit is over, or would be after something that cannot be interrupted.
+
+        ahead      seconds that it will take
+        mebibytes  memory that it will take
+        """
         if self.interrupted:
             raise LimitError("interrupted")
         if self.elapsed() > self._next_tick:
@@ -107,7 +117,7 @@ class Watch:
             raise StageTimeError
 
     def allows(self, seconds: float) -> bool:
-        """Whether there is time for so many seconds of what cannot be interrupted."""
+        """Whether there is time for something that cannot be interrupted and takes so many seconds."""
         if self._allowed is not None and self.elapsed() + seconds > self._allowed:
             return False
         return not seconds or self._beside is None or self._beside.left() >= seconds

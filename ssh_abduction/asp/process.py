@@ -1,7 +1,7 @@
-"""Work in a process of its own, which has a processor to itself: of the threads of one process but one runs Python at a time, and but one grounds.
+"""Does work in a process of its own, which can have a processor to itself: of the threads of one process only one runs Python at a time, and only one grounds.
 
-Guesses are much Python, and so is the search beside them: as two threads they take three times as long. And two threads that ground at
-once wait for each other at each symbol, so within one process one waits for the other to end (`asp/control.py`).
+To make guesses is mostly Python, and so is the search that goes on meanwhile: as two threads both would take three times as long. And two threads that
+ground at the same time wait for each other at each symbol, so within one process one of them waits until the other has grounded (`asp/control.py`).
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _SERVE = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from 
 
 
 def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) -> Result:
-    """What `work` makes of these arguments, and of a watch, which comes last. It is done here, if there can be no other process.
+    """The result of `work`, called with these arguments and a watch, which comes last. It is called in this process if there can be no other.
 
     work, arguments  picklable; so are the result, and what work raises
-    watch            may end the process. What it leaves of the memory limit is that of the other one
+    watch            ends the other process when a limit is over. What is left of its memory limit is the memory limit of the other process
 
     Raises LimitError, also where something from outside ends the process.
     """
@@ -41,13 +41,13 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
             raise error
         return result
     if code < 0:
-        raise LimitError("memory limit")  # else nobody ends it
+        raise LimitError("memory limit")  # a signal ended it, as the system does where memory is short
     return work(*arguments, watch)
 
 
 def _run(work: Callable[..., object], arguments: tuple[object, ...], watch: Watch) -> tuple[int, bytes]:
-    """The exit code of a process, and what it wrote. It ends as its input does, should this process end first."""
-    if "python" not in os.path.basename(sys.executable or "").lower():  # a program that has Python inside
+    """The exit code of a process that does this work, and what it wrote. Should this process end first, the other one's input ends, and it ends with that."""
+    if "python" not in os.path.basename(sys.executable or "").lower():  # this is a program that embeds Python, and cannot be run as Python
         return 1, b""
     with (
         suppress(OSError),
@@ -98,6 +98,7 @@ def serve() -> None:
 
 
 def _end_with_input() -> None:
+    """End this process as soon as its input ends, that is when the process that began it does."""
     while os.read(0, 1):
         pass
     os._exit(1)

@@ -1,23 +1,23 @@
 """An engine for the full theory where places have frames and fewest dstates come first: dstates first, then places and paths.
 
 Frames tell so much that the dstates are all but settled before any place or path is: a turn rotates by known quarters, so whole visits are
-the same or not (`steps/chart.py`). Which ones are is asked of same.lp (`engines/visits.py`), which knows the causal axioms and how turns
-rotate, but not the order of places on a path, or its sides. For what that leaves of the dstates, streets.lp finds the fewest paths and
+the same or not (`steps/chart.py`). Which ones are is asked of visits.lp (`engines/visits.py`), which knows the causal axioms and how turns
+rotate, but not the order of places on a path, or its sides. For what that leaves of the dstates, paths_framed.lp finds the fewest paths and
 places.
 
-*Claim.* Cut to which visits are at one place, a map of the full theory is an answer of same.lp. So the fewest dstates of the latter are
+*Claim.* Cut to which visits are at one place, a map of the full theory is an answer of visits.lp. So the fewest dstates of the latter are
 a lower bound, and if some answer of that cost has streets, all minimal maps are among the answers of that cost with their least streets.
-*If none has*, streets.lp is asked which street shows it, and sides.lp says for that street what order and sides demand of the visits
-that are one. If no single street does, or visits are too many for that, streets.lp is asked which labels clash: smallest sets of nodes at
-dstates that no streets fit; same.lp is told that these do not go together. As every map of the full theory keeps that, bounds still hold.
+*If none has*, paths_framed.lp is asked which street shows it, and sides_framed.lp says for that street what order and sides demand of the visits
+that are one. If no single street does, or visits are too many for that, paths_framed.lp is asked which labels clash: smallest sets of nodes at
+dstates that no streets fit; visits.lp is told that these do not go together. As every map of the full theory keeps that, bounds still hold.
 
 *Beside.* What takes long is guessed in another process, and the guess made a map (`engines/streets.py`). Near it, maps are made here, while
 there it is proven with names, from the guess outwards, how many dstates the causal axioms need (`engines/nearby.py`). Where a map has so
-few, it has the fewest; and the same names then list all ways to be at so few. Some of them fit no frame, which streets.lp sees, or have no
+few, it has the fewest; and the same names then list all ways to be at so few. Some of them fit no frame, which paths_framed.lp sees, or have no
 streets; but each map of the full theory is among them.
 
 *Which street.* In a world half explored the causal axioms allow fewer dstates than order and sides do, in thousands of ways: to forbid
-these one by one does not end. What sides.lp says of a single street takes a rule for each two visits that may be one, so it is said only of
+these one by one does not end. What sides_framed.lp says of a single street takes a rule for each two visits that may be one, so it is said only of
 streets that an answer contradicts.
 
 *Listing.* Most of the time of a long list would go into reading answers. So an answer is asked for the atoms that it may hold, those of the
@@ -433,7 +433,7 @@ class FramedEngine:
         return clashes or [self._clash(labels)]
 
     def _clash(self, labels: Sequence[int]) -> list[int]:
-        """One such set, where it takes the choices of streets.lp to see that there are no paths: nodes are left out while there are none."""
+        """One such set, where it takes the choices of paths_framed.lp to see that there are no paths: nodes are left out while there are none."""
 
         def clashing(nodes: list[int]) -> list[int] | None:
             control = self._path_control(labels, nodes=nodes)

@@ -2,16 +2,16 @@
 
 The axioms of places and paths for each step of a trace are too much for clingo after some dozen steps that keep exploring. But they speak
 of dstates: of which place one is at, and which path it is along. So the dstates have names, as in the causal theory (`engines/naming.py`),
-and ways.lp says what order and sides demand of where the actions at them lead. That depends on how many dstates there are, not on how many
+and sides_frameless.lp says what order and sides demand of where the actions at them lead. That depends on how many dstates there are, not on how many
 steps.
 
-*Claim.* Each map of the full theory is an answer of names.lp and ways.lp, at the cost that it has in the causal theory.
-*Proof.* Let `goes` hold of the links of the map, and of no others; let each atom of ways.lp hold where what its comment says is so in the map.
+*Claim.* Each map of the full theory is an answer of names.lp and sides_frameless.lp, at the cost that it has in the causal theory.
+*Proof.* Let `goes` hold of the links of the map, and of no others; let each atom of sides_frameless.lp hold where what its comment says is so in the map.
 Then its rules are what the axioms say of two or three dstates: a travel keeps the path, and leads on along it, as the order is transitive;
 a turn keeps the place. The rest (`engines/naming.py`) is no dstate of theirs. ∎
 
 So the bounds hold, and if some answer of that cost has places and paths, all minimal maps are among the answers of that cost with the least
-of them. courses.lp tells, and finds the least. If an answer has none, the path of some dstate mostly shows it: ways.lp is told some of
+of them. paths_frameless.lp tells, and finds the least. If an answer has none, the path of some dstate mostly shows it: sides_frameless.lp is told some of
 these paths at a time; a dozen are mostly enough. What no single path shows is forbidden: as few of the answer's links as have
 no places and paths. All labels with the fewest dstates have to be seen for that, which takes most of the time where there are hundreds.
 """
@@ -185,7 +185,7 @@ class PlacesAndPaths:
             parts: list[tuple[str, list[clingo.Symbol]]] = []
             self.named.end_begun()
             if not self._told:
-                control.load(encodings.path("ways"))
+                control.load(encodings.path("sides_frameless"))
                 control.add("ways", [], facts.way_facts(self._task.theory, self._actions))
                 parts.append(("ways", []))
             parts += [("way", facts.numbers(names[dstate])) for dstate in dstates]
@@ -237,12 +237,11 @@ class PlacesAndPaths:
         *,
         far: Collection[_Far] = (),
         single: bool = False,
-        parts: Iterable[str] = ("base", "least"),
+        parts: Iterable[str] = ("base", "least", "paths"),
     ) -> clingo.Control:
         """A control for the places and paths of dstates that are linked so, and of these."""
         control = Control(options, self._asker.watch.check, PREPARING)
-        control.load(encodings.path("courses"))
-        control.load(encodings.path("preference"))
+        control.load_encodings("paths_frameless", "preference")
         dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links), *(f[:2] for f in far)))
         control.add("base", [], facts.course_facts(self._task.theory, dstates, links, self._actions, [f[:2] for f in far], single=single))
         control.ground([(part, []) for part in parts])

@@ -1,10 +1,10 @@
-"""Questions to streets.lp: what order and sides say of the dstates of a trace whose places have frames, and which guesses they let be maps.
+"""Questions to paths_framed.lp: what order and sides say of the dstates of a trace whose places have frames, and which guesses they let be maps.
 
 What takes a choice of places and paths is asked by an engine, under its limits (`engines/framed.py`). What is asked here takes none, or
 hardly any: so little time that some conflicts are limit enough.
 
 *A guess.* Visits are annealed (`guesses/annealing.py`). Where the guess cannot be right its places are let free, and what is there is
-merged by evidence (`guesses/merging.py`), while streets.lp says which visits cannot be one, and which have to be, and which merge leads to
+merged by evidence (`guesses/merging.py`), while paths_framed.lp says which visits cannot be one, and which have to be, and which merge leads to
 no streets: so a guess becomes a map.
 
 *Taken back.* Where what is known by then has no streets, the first merge that shows it is found by bisection, and the two classes that it
@@ -38,7 +38,6 @@ from ssh_abduction.guesses.merging import Told, first_failing, kept, merged_as_t
 from ssh_abduction.steps.apart import Matrix, large_clique
 from ssh_abduction.steps.chart import FramedChart
 from ssh_abduction.steps.localising import faced, states_of, tracked
-from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
@@ -75,10 +74,10 @@ class Paths:
         """The same questions, which these limits end."""
         return Paths(self._trace, self._theory, pinned=self._pinned, check=check)
 
-    def control(self, chart: FramedChart, options: Sequence[str] = ()) -> clingo.Control:
+    def control(self, chart: FramedChart, options: Sequence[str] = ()) -> Control:
         """A control with these axioms, and what happened; nothing is grounded yet."""
         control = Control(options, self._check, PREPARING)
-        control.load(encodings.path("streets"))
+        control.load_encodings("paths_framed")
         control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
         return control
 
@@ -101,7 +100,7 @@ class Paths:
     ) -> clingo.Control:
         """A control for the streets that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
         control = self.control(chart, options)
-        control.load(encodings.path("preference"))
+        control.load_encodings("preference")
         nodes = range(len(labels)) if nodes is None else nodes
         control.add("base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single))
         control.ground([("base", []), *([("again", [])] if single else []), ("least", [])])

@@ -25,7 +25,7 @@ class FramedSides:
 
     def begin(self) -> None:
         """The control is a new one, which knows nothing."""
-        self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # program parts of sides.lp, and their arguments
+        self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # program parts of sides_framed.lp, and their arguments
         self._batch = -1
 
     def extend(self, batch: int) -> None:
@@ -50,13 +50,13 @@ class FramedSides:
         return False
 
     def _say_once(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides.lp, unless it was before. Returns whether it was not."""
+        """Ground a part of sides_framed.lp, unless it was before. Returns whether it was not."""
         if (part, arguments) in self._said:
             return False
         control, batches = self._asker.control, range(self._batch + 1)
         with self._asker.grounding_timed():
             if not self._said:
-                control.load(encodings.path("sides"))
+                control.load(encodings.path("sides_framed"))
                 control.add("sides", [], facts.side_facts(self._theory))
                 control.ground([("sides", []), *(("streets", facts.numbers(batch)) for batch in batches)])
             self._said[part, arguments] = None

@@ -1,4 +1,4 @@
-"""An engine that finds the fewest dstates without naming any: clingo is asked which visits are one (same.lp).
+"""An engine that finds the fewest dstates without naming any: clingo is asked which visits are one (visits.lp).
 
 Names are poor knowledge where many dstates are known from few visits: what is learned of one spare name has to be learned again of
 the next, and each is a choice for nodes all over the world. That two visits are the same is only about these two. A node is
@@ -174,7 +174,7 @@ class VisitLabels:
     def _begin(self, chart: FramedChart) -> None:
         """Take a control that knows nothing, for visits of a chart."""
         self._first_nodes = len(chart.seen)
-        self._asker.control = new_control("same", "", ["--heuristic=Domain"], self._task.speedups)
+        self._asker.control = new_control("visits", "", ["--heuristic=Domain"], self._task.speedups)
         self.batch = -1
         self._visits: set[int] = set()  # that clingo knows, and of these
         self._place_of: dict[int, int] = {}  # where nodes are in the order of choice

@@ -1,4 +1,4 @@
-"""Which visits are one place, by annealing: a guess, close to the truth where the robot was at most places often, and without a proof.
+"""Guesses by annealing which visits are at one place: close to the truth where the robot was at most places often, and without a proof.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.guesses.annealing import annealed
@@ -10,17 +10,18 @@
 >>> guess.sure.tolist()
 [True, True, True]
 
-A map is a hidden Markov model. Its states are the ways that a robot can stand at a place, and an action done there leads to one state:
-of each row of the matrix of transitions one entry is 1. To begin with rows are uncertain (a Dirichlet prior of small weight), and count
-for little; as the temperature falls they count more. A sweep draws the states of stretches of visits anew, given the rows that
-the last draw counts, and the visits before and after the stretch: forward filtering, backward sampling (Scott 2002, "Bayesian methods
-for hidden Markov models"). Stars, and which visits are apart from pinned ones, rule states out from the start. That a travel can be
-made back is not an axiom, but counts as if it had been seen.
+A map is a hidden Markov model. Its states are the ways in which a robot can stand at a place (`Placing` in the glossary), and an action done there leads to one
+state, so each row of the matrix of transitions has one entry of 1. At first the rows are uncertain (a Dirichlet prior of small weight) and count for little;
+as the temperature falls they count more. A sweep goes over stretches of visits and draws their states anew, given the visits before and after the stretch and
+the transitions that the last draw made: forward filtering, backward sampling (Scott 2002, "Bayesian methods for hidden Markov models"). Stars, and which
+visits are apart from pinned ones, rule out states from the start. That a travel can be made back is not an axiom, but each travel counts as if its way back had
+been seen, too.
 
-Names of places are as in `engines/causal.py`: visits that are pairwise apart are places of their own, and each kind of place has spare
-names. There have to be many: places that fall together where names are short do not come apart later.
+Places have names as dstates have in `engines/causal.py`: visits that are pairwise apart are pinned to places of their own, and each kind of place has spare
+names. There have to be many spare names, as places that fall together where names are short do not come apart later.
 
-A causal trace of other actions than turns and travels is annealed in the same way: each step is a visit, to a place at which the robot stands in one way.
+A causal trace of other actions than turns and travels is annealed in the same way. Each step is then a visit to a place at which the robot can stand in one way
+only.
 """
 
 from __future__ import annotations
@@ -38,26 +39,43 @@ from numpy.typing import NDArray
 from ssh_abduction.steps.apart import clique
 from ssh_abduction.steps.chart import Chart, FramedChart, numbered
 
-SPARES = 6  # spare names for places of a kind, and more where names would have more than so many
-VISITS = 12  # visits each
-MORE = 1, 2, 4  # times as many spare names in attempts that follow each other: the fewer visits, the more it takes
-WEIGHT = 0.002  # of the prior: for each of so many states
-STATES = 60  # that an action may lead to
-# An attempt ends where all travels lead where most such travels do. To what power probabilities are taken in the first of so many sweeps:
+# Each kind of place has this many spare names at least: with four, places of mazes fell together that are different.
+SPARES = 6
+# A kind of place that was visited often has more spare names, so that its names have about this many visits each.
+VISITS = 12
+# Successive attempts have 1, 2 and 4 times SPARES as the least number of spare names, and then 1 again: the fewer visits a place has, the more names it takes to find it.
+MORE = 1, 2, 4
+# The Dirichlet prior gives each state this weight as the end of an action, as if it had been seen so often. It is small, so that one visit outweighs all of it.
+WEIGHT = 0.002
+# For the prior, an action may lead to this many states; the true number would make rows of small and large maps count differently.
+STATES = 60
+# An attempt at a careful guess, as pairs: probabilities are taken to this power in the first sweep (a high temperature), and there are so many sweeps. All of
+# nine guesses at mazes of 10 x 10 cells could be made maps after 1,500 sweeps; after 300 only two of them could, and after 700 six.
 ANNEALED = ((0.5, 1500),)
-# The same, and how many visits each name has, where a rough guess will do: one of so many travels may lead elsewhere.
+# An attempt at a rough guess, as above: after each pair the guess is looked at, and taken if it is good enough.
+ROUGH = (0.6, 300), *10 * ((0.75, 150),)
+# A name has up to this many visits in a rough guess: fewer names take fewer sweeps.
+ROUGH_VISITS = 40
+# A rough guess is good enough if at most one of this many travels leads elsewhere than most such travels: the guess is mended afterwards anyway.
 FEW = 200
-ROUGH, ROUGH_VISITS = ((0.6, 300), *10 * ((0.75, 150),)), 40
-# And where each step is a visit; the last again and again, until whoever asks is content.
+# An attempt at a guess in which each step is a visit, as above; the last pair is repeated until whoever asks is content.
 STEPS = (0.75, 1500), (0.75, 500)
-ENTRIES = 60_000_000  # of the table of transitions, that are looked up for all steps in one go: 12 bytes each
-TABLE = 2_000_000  # of the table of transitions itself, states x actions x states, which is made anew for each sweep: some 20 bytes each
-SECONDS = 10.0  # after which there is no other attempt, where each number of names was tried
-COLD = 0.95  # to what power in the last of them
-LAST, QUENCHED = 50, 4.0  # sweeps at the end, so that little is left to chance, and to what power then
-STRETCH = 20  # visits that are drawn in one go
-LIKELY = 16  # states that a visit is drawn from: likely ones, chosen anew
-ROUND = 50  # after so many sweeps
+# There is no guess at steps where looking up the transitions of all steps takes more entries than this, of 12 bytes each: 720 MB.
+ENTRIES = 60_000_000
+# Nor where the table of transitions (states x actions x states) is larger than this. It is made anew for each sweep, and takes some 20 bytes an entry: 40 MB.
+TABLE = 2_000_000
+# After this many seconds there is no other attempt, once each number of spare names in MORE was tried.
+SECONDS = 10.0
+# Probabilities are taken to this power in the last sweep of an attempt, just below the model's own, 1.
+COLD = 0.95
+# Then there are LAST sweeps more with the power QUENCHED, so that hardly anything in the result is left to chance.
+LAST, QUENCHED = 50, 4.0
+# A sweep draws this many consecutive visits in one go. All stretches are drawn side by side, given the visits at their ends.
+STRETCH = 20
+# A visit is drawn from this many states, likely ones; with 8 of them, chosen twice as often, twice as many sweeps are needed.
+LIKELY = 16
+# They are chosen anew after this many sweeps.
+ROUND = 50
 
 States = NDArray[np.int_]
 _Kind = TypeVar("_Kind")
@@ -65,10 +83,10 @@ _Kind = TypeVar("_Kind")
 
 @dataclass(frozen=True)
 class Guess:
-    """What annealing came to.
+    """A guess that annealing came to.
 
-    states  of each visit 4 times the number of a place, and the slot of the place that slot 0 of the visit is
-    sure    of each visit, whether the travels to it and from it lead where most such travels do
+    states  for each visit, 4 times the number of its place plus the slot of the place that slot 0 of the visit is
+    sure    for each visit, whether the travels to it and from it lead where most such travels do
     """
 
     states: States
@@ -80,7 +98,9 @@ class Guess:
         return [states[visit] - states[visit] % 4 + (states[visit] + slot) % 4 if sure[visit] else -1 for visit, slot in chart.facing]
 
     def loosened(self, chart: FramedChart, travels: int) -> Guess:
-        """The guess, not sure of visits to places at which the same travel leads to several, to those it leads to, or so many travels further."""
+        """The same guess, sure of fewer visits: of none to a place from which the same travel leads to several places, to one of these places, or to a
+        place that is at most so many travels away from them.
+        """
         states = self.states.tolist()
         leads: dict[tuple[int, int, int], set[int]] = {}
         for visit, (slot, action) in chart.leaves.items():
@@ -94,7 +114,10 @@ class Guess:
 
 
 def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Guess:
-    """A rough guess at the states of all visits. `check` is called now and then, and may raise."""
+    """A rough guess at the states of all visits: the first that is good enough, or the best after SECONDS.
+
+    check  called now and then, and may raise
+    """
     found: dict[int, Guess] = {}
     began = time.perf_counter()
     for failed, guess in attempts(chart, check, rough=True):
@@ -108,7 +131,7 @@ def attempts(chart: FramedChart, check: Callable[[], None] = lambda: None, *, ro
     """Guesses without end, each with how many travels do not lead where most such travels do.
 
     check  called now and then, and may raise
-    rough  be content with fewer names, as does where places were visited often, and with fewer sweeps
+    rough  use fewer names and fewer sweeps, which will do where places were visited often
     """
     leaves = list(chart.leaves.values())
     for attempt, more in enumerate(cycle(MORE), 1):
@@ -122,10 +145,11 @@ def attempts(chart: FramedChart, check: Callable[[], None] = lambda: None, *, ro
 def annealed_steps(
     chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None] = lambda: None
 ) -> Iterator[list[int]]:
-    """Guesses at the dstates of all steps, as labels, -1 where they are not sure; ever better ones, without end. There are none where that takes too much memory.
+    """Guesses at the dstates of all steps, as labels, -1 where they are not sure. They become better, and there is no end to them; where they would take too much
+    memory, there are none.
 
     clique  steps that are pairwise apart
-    may_be  of each step, the numbers of those of the clique that it may be one with
+    may_be  for each step, the numbers of the steps of the clique that it may be one dstate with
     check   called now and then, and may raise
     """
     options = _step_options(chart, clique, may_be)
@@ -140,13 +164,13 @@ def annealed_steps(
 
 
 class _Drawn:
-    """States of all visits, drawn again and again."""
+    """The states of all visits, which are drawn again and again."""
 
     def __init__(self, options: States, leaves: Sequence[tuple[int, int]], ways: int, random: np.random.Generator) -> None:
         """
-        options  visits x states that are possible; -1 where there are fewer
+        options  visits x the states that are possible for each; padded with -1
         leaves   the slot that each visit but the last ends at, and the action there
-        ways     to stand at a place, each a state: one, or four, of which the last two face back where the first two face ahead
+        ways     how many states a place has, as ways to stand there: one, or four, of which states 2 and 3 face the other way than 0 and 1
         """
         self._random = random
         self._options = options
@@ -157,13 +181,13 @@ class _Drawn:
         self._action = np.array([actions[action] for _, action in leaves], dtype=int)
         self._ways = ways
         self._states = ways * (int(options.max()) // ways + 1)
-        self._back = np.arange(self._states) ^ 2  # of each state, the one that faces the other way
+        self._back = np.arange(self._states) ^ 2  # for each state, the one that faces the other way
         counts = (options >= 0).sum(axis=1)
         self.labels = options[self._visits, (random.random(len(counts)) * counts).astype(int)]
         self._count()
 
     def anneal(self, first: float, sweeps: int, check: Callable[[], None]) -> None:
-        """So many sweeps, while probabilities are taken to higher powers from this one on; and a few more in the end."""
+        """Do so many sweeps, while the power that probabilities are taken to rises from `first` to COLD; and then LAST sweeps more with the power QUENCHED."""
         for sweep in range(sweeps + LAST):
             check()
             power = first + (COLD - first) * sweep / sweeps if sweep < sweeps else QUENCHED
@@ -172,7 +196,7 @@ class _Drawn:
             self._sweep(power)
 
     def sure(self) -> NDArray[np.bool_]:
-        """Of each visit, whether it was drawn last where the actions to it and from it mostly led."""
+        """For each visit, whether in the last draw the actions to it and from it lead where such actions mostly lead."""
         rows = self._rows(self.labels[:-1], self._visits[:-1])
         odd = self._counts[rows, self.labels[1:]] < self._counts[rows].max(axis=1)
         sure = np.ones(len(self._visits), dtype=bool)
@@ -181,16 +205,17 @@ class _Drawn:
         return sure
 
     def failed(self) -> int:
-        """How many travels do not lead where most travels of the same state and action do."""
+        """How many travels do not lead where most travels with the same state and action lead."""
         return int((self._totals - self._counts.max(axis=1)).sum())
 
     def _rows(self, states: States, visits: States) -> States:
-        """The number of what is done in these states, by state and action, at the end of these visits."""
+        """The rows of the table of transitions, numbered by state and action, for visits that are in these states and end as these visits end."""
         turned = (states + self._slot[visits]) % self._ways
         rows: States = (states - states % self._ways + turned) * self._actions + self._action[visits]
         return rows
 
     def _count(self) -> None:
+        """Count the transitions of the last draw, and the ways back of its travels."""
         here, there = self.labels[:-1], self.labels[1:]
         rows = self._rows(here, self._visits[:-1])
         entries = rows * self._states + there
@@ -203,7 +228,9 @@ class _Drawn:
         self._totals = self._counts.sum(axis=1)
 
     def _entries(self, states: States) -> States:
-        """visits but the last x states x states of the next: the entry of the table of transitions. States below 0 are the last one of the table."""
+        """The entries of the table of transitions, for all visits but the last x states of a visit x states of the next one. The padding, -1, has the last
+        row and the last column of the table, where nothing is likely.
+        """
         rows = self._rows(states[:-1], self._visits[:-1, None])
         rows[states[:-1] < 0] = self._states * self._actions
         there = np.where(states[1:] < 0, self._states, states[1:])
@@ -211,7 +238,7 @@ class _Drawn:
         return entries
 
     def _transitions(self, entries: States, power: float) -> NDArray[np.float32]:
-        """How likely an action leads from one state to the other, for each of these entries."""
+        """For each of these entries, how likely its action leads from its first state to the other, to this power."""
         shape = self._states * self._actions + 1, self._states + 1
         totals = self._totals + np.float32(STATES * WEIGHT)
         table = np.zeros(shape, dtype=np.float32)
@@ -221,7 +248,7 @@ class _Drawn:
         return table.ravel()[entries]
 
     def _choose(self, power: float) -> None:
-        """Choose the states that visits are drawn from: at random, the likely ones sooner, and the last one drawn for sure."""
+        """Choose the LIKELY states that each visit is drawn from until the next choice: at random, likely ones sooner, and always the one drawn last."""
         likely = self._transitions(self._entries(self._options), power)
         place = (self._options == self.labels[:, None]).argmax(axis=1)
         starts, lengths = self._stretches(0)
@@ -264,12 +291,12 @@ class _Drawn:
         self._count()
 
     def _stretches(self, first: int) -> tuple[States, States]:
-        """Where stretches of visits start, and how long they are."""
+        """Where the stretches of visits start, if the second one starts at visit `first`, and how long they are."""
         starts = np.unique(np.append(0, np.arange(first, len(self._visits), STRETCH)))
         return starts, np.diff(np.append(starts, len(self._visits)))
 
     def _filtered(self, states: States, likely: NDArray[np.float32], place: States, starts: States, lengths: States) -> NDArray[np.float32]:
-        """visits x states: how likely a visit is in a state, given what comes before it in its stretch and the visit before that."""
+        """Visits x states: how likely a visit is in a state, given the visits before it in its stretch, and the last draw of the visit before the stretch."""
         ahead = (states >= 0).astype(np.float32)
         for i in range(int(lengths.max())):
             visits = starts[lengths > i] + i
@@ -282,9 +309,9 @@ class _Drawn:
 
 
 def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
-    """The states that each visit may be in."""
+    """The states that each visit may be in: visits x states, padded with -1."""
     misfits = chart.misfits
-    # The star of each visit in a frame whose slot r is slot 0 of the visit, and its kind: the least of them.
+    # The star of each visit in a frame whose slot r is slot 0 of the visit; and its kind, which is the least of these four stars.
     turned = [[tuple(star[(slot - r) % 4] for slot in range(4)) for r in range(4)] for star in chart.stars]
     kinds = [min(stars) for stars in turned]
     pinned = clique(np.logical_and.reduce(misfits), numbered(kinds))
@@ -299,14 +326,14 @@ def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
 
 
 def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]]) -> States:
-    """The states that each step may be in: those of the clique, and spare ones for each view."""
+    """The states that each step may be in: those of the clique, and the spare ones of its view. Steps x states, padded with -1."""
     pinned = set(clique)
     spare = _spare(chart.seen, clique, SPARES, ROUGH_VISITS)
     return _padded([[*options, *(() if step in pinned else spare[chart.seen[step]])] for step, options in enumerate(may_be)])
 
 
 def _spare(kinds: Sequence[_Kind], pinned: Sequence[int], spares: int, visits_each: int) -> dict[_Kind, range]:
-    """Spare names for each kind of place, beyond those of the pinned visits."""
+    """Spare names for each kind of place. The first names, which come before them, are those of the pinned visits."""
     named = Counter(kinds[visit] for visit in pinned)
     spare: dict[_Kind, range] = {}
     names = len(pinned)
@@ -317,6 +344,7 @@ def _spare(kinds: Sequence[_Kind], pinned: Sequence[int], spares: int, visits_ea
 
 
 def _padded(options: Sequence[Sequence[int]]) -> States:
+    """Rows of different length as an array, padded with -1."""
     padded = np.full((len(options), max(map(len, options))), -1)
     for visit, states in enumerate(options):
         padded[visit, : len(states)] = states

@@ -1,4 +1,4 @@
-"""Where the steps of a long trace are, by a map of its beginning: also where that map lacks links.
+"""Finds where the steps of a long trace are by a map of its first steps, even if that map lacks links.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.guesses.continuing import followed
@@ -7,13 +7,13 @@
 >>> followed(Log(trace, Theory.causal()), [0, 1, 2, 0])
 [0, 1, 2, 0, 1, 2, 0, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1]
 
-The trace is walked along the links of the map. Where the map does not say where an action leads, that is one of the dstates that show what is seen then: the
-one that predicts the steps from there on longest, if it is ahead of all others and not contradicted soon. Where that is not clear the robot is lost, until
-what it sees and does tells where it is: Markov localisation, with beliefs that are all or nothing. What one walk does not settle the next one may, as more of the map is known by
-then. In the end a link that none has settled leads to a new dstate.
+The trace is walked along the links of the map. Where the map does not say where an action leads, it must lead to a dstate that shows what is seen next. Of these
+dstates, the one that predicts the following steps longest is taken, if it is clearly ahead of all others and is not contradicted at the end of its prediction. If
+no dstate is, the robot is lost until what it sees and does tells where it is: Markov localisation, with beliefs that are all or nothing. A link that one walk
+does not settle may be settled by the next walk, as more of the map is known by then. A link that no walk settles leads to a new dstate in the end.
 
-So a link may be wrong, and so may be the map. Then the trace contradicts it sooner or later, and the dstate where it does is forgotten, or more of those before it where
-that does not help. What comes of that has more dstates than it needs, some of which are one (`guesses/merging.py`).
+So a link may be wrong, and the map that was given may be. Then the trace contradicts it sooner or later, and the dstate where it does is forgotten, or more of the
+dstates before it where that does not help. The result has more dstates than it needs, as some of them could be one: `guesses/merging.py` merges them.
 """
 
 from __future__ import annotations
@@ -23,27 +23,33 @@ from typing import TypeAlias
 
 from ssh_abduction.steps.log import Log
 
-LOOKED = 300  # steps ahead, at most, that are looked at to tell where the robot is
-SETTLED = 10  # steps that a dstate has to predict for a link to lead there,
-FOUND = 20  # and where the robot is lost for it to be there,
-AHEAD = 2  # and so many more than any other
-WALKS = 100  # after which the map is given up; after half of them the robot is lost no more: what is not settled by then is new
-MANY = 10  # times as many dstates as it had, with which it is given up, too
+# At most this many steps are predicted from a dstate, to tell whether the robot is there.
+LOOKED = 300
+# A link leads to a dstate only if that predicts at least this many steps.
+SETTLED = 10
+# A robot that is lost is at a dstate only if that predicts at least this many steps: more than for a link, as here nothing is known of where it comes from.
+FOUND = 20
+# And in both cases only if it predicts this many steps more than any other dstate.
+AHEAD = 2
+# After this many walks the map is given up. After half of them the robot may be lost no longer: what is not settled by then is a new dstate.
+WALKS = 100
+# The map is also given up once it has this many times as many dstates as it had to begin with.
+MANY = 10
 
 _Link: TypeAlias = tuple[int, int]  # dstate, action
 
 
 def followed(log: Log, labels: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int] | None:
-    """Labels of all steps of a trace, of a map near that of its first steps; None where too much of that is contradicted.
+    """Labels of all steps of a trace, which make a map near the given one; None where too much of that one is contradicted.
 
     labels  of a map of the first steps, numbered from 0
     check   called now and then; may raise
     """
     known = _Map(log, labels, check)
-    patient, furthest, back = True, 0, 1
+    may_be_lost, furthest, back = True, 0, 1
     for walk in range(WALKS):
         links = len(known.leads)
-        found = known.walked(lost=patient)
+        found = known.walked(may_be_lost=may_be_lost)
         if known.is_too_large:
             return None
         if len(found) < len(log.seen):
@@ -52,12 +58,12 @@ def followed(log: Log, labels: Sequence[int], check: Callable[[], None] = lambda
         elif -1 not in found:
             return found
         elif len(known.leads) == links or walk > WALKS // 2:
-            patient = False
+            may_be_lost = False
     return None
 
 
 class _Map:
-    """A map of the first steps, to which links are added, and dstates.
+    """A map of the first steps, to which links and dstates are added.
 
     leads  where actions lead, by dstate and action
     """
@@ -69,7 +75,7 @@ class _Map:
         self.leads = {(labels[t], log.actions[t]): labels[t + 1] for t in range(len(labels) - 1)}
         self._start: int | None = labels[0]
         self._most = MANY * len(self._shows)
-        self._like: dict[int, list[int]] = {}  # the dstates where something is seen
+        self._like: dict[int, list[int]] = {}  # for each observation, the dstates that show it
         for dstate, seen in self._shows.items():
             self._like.setdefault(seen, []).append(dstate)
 
@@ -77,15 +83,18 @@ class _Map:
     def is_too_large(self) -> bool:
         return len(self._shows) > self._most
 
-    def walked(self, *, lost: bool) -> list[int]:
-        """Labels of the steps, -1 where the robot is lost, if it may be; those before the first one that contradicts the map. Links that are clear on the way are added."""
+    def walked(self, *, may_be_lost: bool) -> list[int]:
+        """Labels of the steps, up to the first one that contradicts the map. Links that become clear on the way are added to the map.
+
+        may_be_lost  where it is not clear where the robot is, the label is -1; else the robot is at a new dstate there
+        """
         labels: list[int] = []
         for t, seen in enumerate(self._seen):
             link = (labels[-1], self._actions[t - 1]) if t and labels[-1] >= 0 else None
             there = self.leads.get(link) if link else None if t else self._start
             if there is None:
                 there = self._predicting(t, SETTLED if link else FOUND, link)
-                if there is None and not lost:
+                if there is None and not may_be_lost:
                     there = self._new(seen)
                 if link and there is not None:
                     self.leads[link] = there
@@ -97,7 +106,7 @@ class _Map:
         return labels
 
     def forget(self, dstates: Iterable[int]) -> None:
-        """Let the map know nothing of these dstates."""
+        """Take these dstates and all links to and from them out of the map."""
         forgotten = {dstate for dstate in dstates if dstate >= 0}
         for dstate in forgotten:
             self._like[self._shows[dstate]].remove(dstate)
@@ -113,9 +122,9 @@ class _Map:
         return dstate
 
     def _predicting(self, step: int, least: int, link: _Link | None = None) -> int | None:
-        """The dstate of a step that predicts at least so many steps from there on, and clearly more than any other; None where there is no such.
+        """The dstate that predicts at least so many steps from this one on, and AHEAD more than any other; None if there is no such dstate.
 
-        link  is taken to lead to each dstate that is tried
+        link  is taken to lead to each dstate while that is tried
         """
         self._check()
         best, most, next_most = None, 0, 0
@@ -132,7 +141,7 @@ class _Map:
         return best if most >= min(least, len(self._seen) - step) and most >= next_most + AHEAD else None
 
     def _predicted(self, dstate: int, step: int) -> tuple[int, bool]:
-        """How many steps a dstate predicts from this one on, itself among them, and whether what comes then contradicts it."""
+        """How many steps are predicted if this one is at that dstate, this step counted, and whether the next one contradicts the map."""
         for t in range(step + 1, min(step + LOOKED, len(self._seen))):
             there = self.leads.get((dstate, self._actions[t - 1]))
             if there is None:

@@ -1,18 +1,18 @@
-"""A small map of the causal theory without a search: steps are merged where much speaks for it, in the order of how much.
+"""Finds a small map of the causal theory without a search: steps are merged, those first for which there is most evidence.
 
 >>> from ssh_abduction.steps.apart import Continuations
 >>> from ssh_abduction.guesses.merging import merged
 >>> merged(Continuations([0, 1, 0, 1], [0, 0, 0]).apart(), [(0, 0, 1), (1, 0, 2), (2, 0, 3)], [0, 1])
 [0, 1, 0, 1]
 
-Steps that are apart are known dstates to begin with. To merge two steps means to merge what the same actions lead to from them, and so on:
-all of it is merged, or nothing, if some two are apart. The more two steps have to say about each other, the less likely that is by chance:
-the *evidence* is how many merges that makes, and how often it confirms one made before. Steps that fit a single known dstate, with much
-evidence, go first; then those with less, or with rivals that have clearly less. A step that fits none is a new dstate.
+The steps of a clique are *known* dstates to begin with. If two steps are one dstate, so are the steps that the same actions lead to from them, and so on. All of
+these are merged; or none, if some two of them are apart. The more steps a merge touches without a contradiction, the less likely that is by chance: so the
+*evidence* for a merge is how many classes it merges, plus how often it confirms a merge made before. Steps that fit one known dstate only, with much evidence,
+are merged first; then steps with less evidence, or for which other known dstates have clearly less. A step that fits no known dstate becomes one.
 
-What is guessed at can be finished in the same way: nodes that a guess has at one dstate are known to begin with, as far as they can be one.
-Where more is told on the way, of steps that are apart or one, the merge that leads to a contradiction is taken back.
-And the dstates of a map are thinned so: those seen least are merged with others, as long as that leaves a map, those with most evidence first.
+A guess is completed in the same way: nodes to which it gives one label are merged first, as far as they can be one, and are known dstates then. While that goes
+on, a caller can tell which nodes are apart or one, and the merge that led to a contradiction is taken back. And the dstates of a map are thinned in the same
+way: dstates seen least are merged with others as long as that leaves a map, those with most evidence first.
 
 This is evidence-driven state merging (Lang, Pearlmutter, Price 1998, "Results of the Abbadingo One DFA Learning Competition") for one
 trace, from known dstates all over it rather than from a root.
@@ -32,20 +32,23 @@ from numpy.typing import NDArray
 from ssh_abduction.steps.apart import Matrix
 from ssh_abduction.steps.chart import Chart, Link, numbered
 
-# Least evidence for a merge, and how much it has to be ahead of the next; among how many known dstates at most:
+# What is demanded of a merge, ever less: by how much its evidence is ahead of the next best merge of the same step, and how many known dstates may fit that
+# step. What is demanded last lets every step be merged that fits some known dstate.
 DEMANDS = ((10, 1), (5, 1), (5, 2), (3, 1), (3, 3), (2, 2), (2, 10), (1, 3), (1, 100), (0, 1), (0, 2), (0, 1000))
-
-THINNED = 10, 5, 3, 0  # how much more evidence than for the next, for dstates of a map to be merged
-TAKEN_BACK = 20  # merges, after which there is no map,
-THIN_ENOUGH = 5  # and after which a map is thin enough
+# The same for merges of two known dstates, when a map is thinned.
+THINNED = 10, 5, 3, 0
+# When this many merges contradicted what the caller told, there is no map near the guess.
+TAKEN_BACK = 20
+# When this many merges did while a map was thinned, the map is thin enough: with 40 of them it came to have at most 1 % fewer dstates, and took twice as long.
+THIN_ENOUGH = 5
 
 Told: TypeAlias = tuple[Matrix, Sequence[tuple[int, int]]]  # which nodes are apart, and pairs that are one
-_State: TypeAlias = tuple[NDArray[np.int_], NDArray[np.bool_], Matrix, list[NDArray[np.int_]], list[dict[int, int]]]
-_Merge: TypeAlias = tuple[int, int]  # two steps whose classes become one; where they are one, that becomes known
+_Snapshot: TypeAlias = tuple[NDArray[np.int_], NDArray[np.bool_], Matrix, list[NDArray[np.int_]], list[dict[int, int]]]  # of a _Classes
+_Merge: TypeAlias = tuple[int, int]  # two steps whose classes become one. Where these are one class already, that becomes a known dstate
 
 
 def merged(apart: Matrix, links: Iterable[Link], clique: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
-    """The dstate of each node of a chart in some map, numbered by first node.
+    """The dstate of each node of a chart in a small map, numbered by first node.
 
     apart   which nodes are apart, nodes x nodes
     links   of the chart
@@ -59,9 +62,9 @@ def merged(apart: Matrix, links: Iterable[Link], clique: Sequence[int], check: C
 
 
 def merged_near(apart: Matrix, links: Iterable[Link], guess: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
-    """The same near a guess.
+    """The dstate of each node of a chart in a small map near a guess.
 
-    guess  a label of each node; -1 where it is not known. Nodes that cannot be at one dstate with the others of their label leave it
+    guess  a label for each node; -1 where it is not known. A node that cannot be one dstate with the nodes before it of the same label is free, too
     """
     classes = _from_guess(apart, links, guess, check)
     classes.settle_all()
@@ -76,12 +79,14 @@ def merged_as_told(
     fits: Callable[[Sequence[int], Sequence[int]], bool],
     check: Callable[[], None] = lambda: None,
 ) -> list[int] | None:
-    """The same, where more is told on the way, and thinned in the end. None where that contradicts, or no map is found soon.
+    """The dstate of each node in a small map near a guess, where the caller knows more than the causal axioms. The map is thinned. None where the guess contradicts
+    what the caller knows, or no map is found soon.
 
-    tell  is asked what follows from labels of all nodes, and which of these are still open, whenever they have changed; None: they contradict
-    fits  is asked whether they do not, sooner
+    tell  given labels of all nodes, and the nodes whose labels are still open, says which nodes are apart and which are one; None if the labels contradict what
+          the caller knows. It is asked whenever labels have changed
+    fits  says, given the same, only whether the labels may hold, which takes less time
     """
-    classes = _Heeding(apart, links, tell, fits, check)
+    classes = _ToldClasses(apart, links, tell, fits, check)
     classes.take(guess)
     try:
         classes.settle_all()
@@ -94,14 +99,16 @@ def merged_as_told(
 
 
 def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int]:
-    """The same where nothing is merged but what has to be: what is not known, or leaves its label, is something new."""
+    """The dstate of each node in a map that keeps the labels of a guess as far as possible, and merges only what has to be merged for that. All nodes that are -1
+    in the guess, or cannot keep their label, are at dstates of their own.
+    """
     return _from_guess(apart, links, guess).labels()
 
 
 def thinned(chart: Chart, labels: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
-    """The dstate of each node in a map where no two dstates of this one are left that could be one.
+    """The dstate of each node in a smaller map: dstates of the given map are merged until no two of them can be one.
 
-    Those seen at the fewest nodes are merged first, each with that for which the evidence is most.
+    Dstates seen at the fewest nodes are merged first, each with the dstate for which there is most evidence.
 
     labels  of the nodes of a chart, in a map
     """
@@ -115,7 +122,7 @@ def thinned(chart: Chart, labels: Sequence[int], check: Callable[[], None] = lam
 
 
 def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link], check: Callable[[], None]) -> Matrix:
-    """Which dstates of a map are apart: those at which something else is seen, or from which an action leads to such, as far as the map says."""
+    """Which pairs of dstates of a map are apart: those that show different views, or from which one action leads to dstates that are apart."""
     leads: dict[int, NDArray[np.int_]] = {}
     for dstate, action, leads_to in links:
         leads.setdefault(action, np.full(len(seen), -1))[dstate] = leads_to
@@ -131,32 +138,32 @@ def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link], check: Callable
 
 
 def _from_guess(apart: Matrix, links: Iterable[Link], guess: Sequence[int], check: Callable[[], None] = lambda: None) -> _Classes:
-    """Nodes that a guess has at one dstate are merged, as far as they can be one; what follows from that is merged, too."""
+    """Classes in which the nodes that a guess gives one label are merged, as far as they can be one, with all that follows from that."""
     classes = _Classes(apart, links, check)
     classes.take(guess)
     return classes
 
 
 class _Classes:
-    """Steps that were merged.
+    """Classes of steps that were merged.
 
-    root   of each step, the step that stands for its class
-    known  of each root, whether its class is a dstate of the map
+    root   for each step, the step that stands for its class
+    known  for each root, whether its class is a known dstate
     """
 
     def __init__(
         self, apart: Matrix, links: Iterable[Link], check: Callable[[], None] = lambda: None, nodes: NDArray[np.int_] | None = None
     ) -> None:
         """
-        nodes  how many nodes each step stands for, if not one
+        nodes  how many nodes each step stands for (default one)
         """
         steps = len(apart)
         self._nodes = nodes
         self.root = np.arange(steps)
         self.known = np.zeros(steps, dtype=bool)
-        self._apart = apart.copy()  # of each root, the steps that are apart from some step of its class
+        self._apart = apart.copy()  # the row of each root: which steps are apart from some step of its class
         self._members: list[NDArray[np.int_]] = [np.array([t]) for t in range(steps)]
-        self._leads: list[dict[int, int]] = [{} for _ in range(steps)]  # of each root, by action
+        self._leads: list[dict[int, int]] = [{} for _ in range(steps)]  # for each root, a step that each action leads to
         for t, action, u in links:
             self._leads[t][action] = u
         self._undo: list[tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]] = []
@@ -164,7 +171,7 @@ class _Classes:
         self._check = check
 
     def take(self, guess: Sequence[int]) -> None:
-        """Merge the nodes that a guess has at one dstate, as far as they can be one. These are known dstates."""
+        """Merge the nodes that a guess gives one label, as far as they can be one. Their classes become known dstates."""
         first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
         self.known[list(first.values())] = True
         for node, label in enumerate(guess):
@@ -173,7 +180,7 @@ class _Classes:
                 self.merge(first[label], node)
 
     def labels(self) -> list[int]:
-        """The class of each step, numbered by first step."""
+        """The class of each step; classes are numbered by their first steps."""
         return numbered(self.root.tolist())
 
     def settle_all(self) -> None:
@@ -185,19 +192,19 @@ class _Classes:
             self._check()
 
     def thin_all(self) -> None:
-        """Merge known dstates while there are some that can be one."""
+        """Merge known dstates until no two of them can be one."""
         for evidence in THINNED:
             while self._advanced(partial(self.thin, evidence)):
                 pass
 
     def _advanced(self, step: Callable[[], None]) -> bool:
-        """Take a step. Returns whether any merges were made."""
+        """Take a step, which may make merges. Returns whether it made any."""
         self._made = []
         step()
         return bool(self._made)
 
     def make(self, merge: _Merge) -> None:
-        """Make two classes one, or a class known."""
+        """Merge the classes of two steps; if they have one class, make that a known dstate."""
         a, b = (int(self.root[t]) for t in merge)
         if a == b:
             self.known[a] = True
@@ -206,11 +213,15 @@ class _Classes:
         self._made.append(merge)
 
     def unsettled(self) -> NDArray[np.int_]:
-        """The steps of classes that are no known dstates."""
+        """The steps whose classes are not known dstates."""
         return np.flatnonzero(~self.known[self.root])
 
     def settle(self, evidence: int, rivals: int) -> None:
-        """Merge unsettled classes with known dstates, as far as that evidence goes, or make them known."""
+        """Merge unsettled classes with known dstates. A class that fits no known dstate becomes one.
+
+        evidence  only where the evidence is ahead of that for the next dstate by this much
+        rivals    only classes that fit at most this many known dstates
+        """
         steps = self.unsettled()
         fitting = (~self._apart[np.flatnonzero(self.known)][:, steps]).sum(axis=0)
         for t in steps[np.argsort(fitting, kind="stable")].tolist():
@@ -228,18 +239,21 @@ class _Classes:
                 self.make((ranked[0][1], root))
 
     def settle_at_any_rate(self) -> None:
-        """Merge the class of the first step that is not settled with the known dstate that most speaks for, if it fits any; or make it known."""
+        """Merge the class of the first unsettled step with the known dstate for which there is most evidence; if it fits none, make it one."""
         for t in self.unsettled()[:1].tolist():
             root = int(self.root[t])
             ranked = self._ranked(root, self._fitting(root))
             self.make((ranked[0][1] if ranked else root, root))
 
     def thin(self, evidence: int) -> None:
-        """Merge known dstates, those seen least first, as far as that evidence goes."""
+        """Merge known dstates with others, those seen least first.
+
+        evidence  only where the evidence is ahead of that for the next dstate by this much
+        """
         nodes = np.bincount(self.root, self._nodes)
         for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: nodes[root]):
             self._check()
-            if self.known[root]:  # still
+            if self.known[root]:  # it may have been merged since
                 ranked = self._ranked(root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True)
                 if ranked and _is_ahead(ranked, evidence):
                     self.make((ranked[0][1], root))
@@ -251,7 +265,7 @@ class _Classes:
         return fits
 
     def _ranked(self, root: int, fits: Sequence[int], *, forced: bool = False) -> list[tuple[int, int]]:
-        """The evidence for each of these dstates that the class can be merged with, most first, and the dstate."""
+        """Those of these dstates that the class can be merged with, as (evidence, dstate), the one with most evidence first."""
         found = []
         for dstate in fits:
             evidence = self.merge(dstate, root, forced=forced)
@@ -261,9 +275,10 @@ class _Classes:
         return sorted(found, reverse=True)
 
     def merge(self, a: int, b: int, *, forced: bool = False) -> int | None:
-        """Merge two classes, and all that has to be merged then. Returns the evidence; None, and nothing is changed, if some are apart.
+        """Merge two classes, and all that has to be merged with them. Returns the evidence. If that would merge steps that are apart, nothing is changed, and None
+        is returned.
 
-        forced  let known dstates turn out to be one
+        forced  let known dstates be merged with each other
         """
         self._undo = []
         work = [(a, b)]
@@ -297,11 +312,11 @@ class _Classes:
 
 
 class _Contradicted(Exception):  # noqa: N818 - not an error
-    """What is told contradicts, whatever is taken back."""
+    """The guess contradicts what the caller told, or too many merges do."""
 
 
-class _Heeding(_Classes):
-    """Classes near a guess of which more is told whenever some were merged. The merges that contradict it are taken back."""
+class _ToldClasses(_Classes):
+    """Classes near a guess. Whenever some were merged, the caller tells what follows from that; merges that contradict it are taken back."""
 
     def __init__(
         self,
@@ -317,19 +332,19 @@ class _Heeding(_Classes):
         self.may_take_back = TAKEN_BACK
 
     def settle_all(self) -> None:
-        if not self._heeds():
+        if not self._keeps_what_is_told():
             raise _Contradicted
         super().settle_all()
 
     def _advanced(self, step: Callable[[], None]) -> bool:
-        before = self._state()
+        before = self._snapshot()
         advanced = super()._advanced(step)
-        if advanced and not self._heeds():
+        if advanced and not self._keeps_what_is_told():
             self._take_back_first_wrong(before, tuple(self._made))
         return advanced
 
-    def _take_back_first_wrong(self, before: _State, made: Sequence[_Merge]) -> None:
-        """Make these merges anew up to the first that contradicts, whose classes are apart from now on."""
+    def _take_back_first_wrong(self, before: _Snapshot, made: Sequence[_Merge]) -> None:
+        """Make these merges anew, up to the first with which they contradict what is told. The two classes of that merge are apart from now on."""
 
         def fits(merges: int) -> bool:
             self._check()
@@ -345,17 +360,20 @@ class _Heeding(_Classes):
         self._apart[np.ix_(a, b)] = self._apart[np.ix_(b, a)] = True
         self._apart[self.root[a[0]], b] = self._apart[self.root[b[0]], a] = True
 
-    def _make_anew(self, before: _State, merges: Iterable[_Merge]) -> None:
+    def _make_anew(self, before: _Snapshot, merges: Iterable[_Merge]) -> None:
+        """Go back to a snapshot, and make these merges."""
         root, known, apart, members, leads = before
         self.root, self.known, self._apart, self._members, self._leads = root.copy(), known.copy(), apart.copy(), list(members), list(leads)
         for merge in merges:
             self.make(merge)
 
-    def _state(self) -> _State:
+    def _snapshot(self) -> _Snapshot:
         return self.root.copy(), self.known.copy(), self._apart.copy(), list(self._members), list(self._leads)
 
-    def _heeds(self) -> bool:
-        """Keep what is told of steps apart, and merge those that are one, as far as they can be. Returns whether nothing contradicts."""
+    def _keeps_what_is_told(self) -> bool:
+        """Ask the caller, note which steps are apart, and merge those that are one, as far as they can be. Returns False where the classes contradict what the caller
+        knows.
+        """
         self._check()
         told = self._tell(self.labels(), self.unsettled().tolist())
         if told is None:
@@ -370,10 +388,10 @@ class _Heeding(_Classes):
 
 
 def first_failing(holds: Callable[[int], bool], first: int, last: int) -> int:
-    """The first of these numbers for which something does not hold, if it does not for those that follow either; the last is known to be one such."""
+    """The first number from `first` to `last` for which `holds` is false, found by bisection: it is false for all numbers after that, and for `last` anyway."""
     return first + bisect_left(range(first, last), True, key=lambda number: not holds(number))
 
 
 def _is_ahead(ranked: Sequence[tuple[int, int]], evidence: int) -> bool:
-    """Whether the first has that much more evidence than the next."""
+    """Whether the first merge has this much more evidence than the next, or this much at all where it is the only one."""
     return ranked[0][0] >= evidence + (ranked[1][0] if len(ranked) > 1 else 0)

@@ -1,4 +1,4 @@
-"""A consistent map without a search: each step leads somewhere new, unless the axioms say where.
+"""Makes a consistent map without a search: each step leads somewhere new, unless the axioms say where it leads.
 
 >>> from ssh_abduction import Action, Step, Theory
 >>> from ssh_abduction.guesses.tree import Sketch
@@ -9,19 +9,19 @@
 >>> sketch.map().labels
 (0, 1, 2, 3, 0)
 
-A sketch is a tree of streets. A travel goes to a new place, or back to the place that it came from along the same street; so two
-streets share one place at most, and what lies ahead on a branch lies on no street that the branch leaves: the axioms of the order and
-of the sides hold. Within a place the axioms of turns, courses and headings decide what is equal.
+A sketch is a tree of paths. A travel leads to a new place, or back along the same path to the place that it came from. So two paths share one place at most,
+and the places ahead on a branch lie on no path that the branch leaves: the axioms of order and sides hold. Within a place the axioms of turns, courses and
+headings decide which dstates are one.
 
-Where the way back looks otherwise than remembered, the travel goes to a new place. Where something remembered as known is later
-contradicted, the sketch is given up; one without `homing`, that never takes a place for one seen before unless next_place asks
-for it, may still do.
+Where the place that a travel would come back to does not show what was seen there before, the travel leads to a new place. Where the trace later contradicts
+that a step was at a known place, the sketch is given up. A sketch without `homing` takes no place for one seen before, unless the axiom next_place asks for it,
+so it may hold where another was given up.
 
 Where the theory asks for no frames, a sketch may still have them: that adds axioms, and leaves none out.
 
-A sketch may also begin with a map of some steps, and grow like a tree beyond it. What is new then lies on new streets, or on one known street, and
-contradicts nothing either. But a turn can be the first to show how two known streets cross, which then has to fit all their places; and without frames,
-a dstate that a turn leads to itself lies on no street: whether that fits, the sketch does not say.
+A sketch may also begin with a map of some steps, and grow like a tree beyond it. What is new then lies on new paths, or on one known path, and contradicts
+nothing either. But there are two cases in which the sketch cannot say whether it is consistent: a turn may be the first to show how two known paths cross,
+which has to fit all their places; and without frames, a turn may lead from a dstate to itself, which then can be on no path.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class _Contradiction(Exception):  # noqa: N818 - not an error
 
 
 @dataclass(slots=True)
-class _State:
-    """A dstate, and what is known of it so far."""
+class _Known:
+    """What is known of a dstate so far."""
 
     view: View
     seen: object
@@ -53,11 +53,11 @@ class _State:
 
 
 class Sketch:
-    """A map of the steps so far, which grows with each.
+    """A map of the steps so far, which grows with each step.
 
-    homing   whether a travel may go back to where it came from, though next_place does not ask for it
-    framed   whether places have frames, though the theory does not ask for them: most turns then lead to what is known
-    certain  whether the map is known to be consistent; if not, it is to be checked, and this to be set
+    homing   whether a travel may lead back to where it came from, even if the theory has no axiom next_place
+    framed   whether places have frames, even if the theory asks for none: then most turns lead to known dstates
+    certain  whether the map is known to be consistent. If not, the caller has to check it, and may set this then
     """
 
     def __init__(self, first: Step, theory: Theory, homing: bool = True, framed: bool = False) -> None:
@@ -65,13 +65,13 @@ class Sketch:
         self._theory = theory
         self._homing = homing or theory.next_place
         self._framed = framed or theory.star == "frame"
-        self._states: list[_State] = []
+        self._states: list[_Known] = []
         self._links: dict[tuple[int, str], int] = {}
-        self._stars: list[object] = []  # of each place
-        self._orders: list[list[int]] = []  # of each path, the places as direction +1 meets them
+        self._stars: list[object] = []  # for each place, its star
+        self._orders: list[list[int]] = []  # for each path, its places in the order in which direction 1 meets them
         self._along: dict[tuple[int, int, int], int] = {}  # place, path, direction: dstate
-        self._facing: dict[tuple[int, int], int] = {}  # place, heading: dstate, where places have frames
-        self._slots: dict[tuple[int, int], tuple[int, int]] = {}  # place, heading: path, direction, where places have frames
+        self._facing: dict[tuple[int, int], int] = {}  # place, heading: dstate; only where places have frames
+        self._slots: dict[tuple[int, int], tuple[int, int]] = {}  # place, heading: path, direction; only where places have frames
         self._excused: tuple[tuple[int, int], ...] = ()  # pairs of paths
         self._map: SSHMap | None = None
         self._tree = self.certain = True
@@ -81,13 +81,13 @@ class Sketch:
 
     @classmethod
     def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
-        """Sketches of a trace that begins so, those first that become smaller if they are not given up."""
+        """All kinds of sketches of a trace that begins with this step. Those that become smaller, if they are not given up, come first."""
         framed = [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
         return [cls(first, theory, homing, frames) for frames in framed for homing in (True, False)]
 
     @classmethod
     def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Sketch:
-        """A sketch that begins with a map of a trace, of a theory with all its axioms."""
+        """A sketch that begins with a map of a trace. The map satisfies all axioms of the theory."""
         sketch = cls(trace.steps[0], theory)
         sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.labels)
         sketch._links = {(s, action): x for s, action, x in ssh_map.links}
@@ -98,7 +98,7 @@ class Sketch:
         seen = dict(zip(reversed(ssh_map.labels), reversed(trace.steps), strict=True))
         for s in ssh_map.dstates:
             place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
-            sketch._states.append(_State(s.view, observation(seen[s.id], theory), place, heading, s.path, direction))
+            sketch._states.append(_Known(s.view, observation(seen[s.id], theory), place, heading, s.path, direction))
             stars.setdefault(place, sketch._star(seen[s.id], heading))
             if s.path is not None:
                 sketch._along[place, s.path, direction] = s.id
@@ -116,7 +116,7 @@ class Sketch:
         return sketch
 
     def extend(self, action: Action, step: Step) -> bool:
-        """Go on with an action and what was seen then. False where that contradicts the sketch, which is of no use from then on."""
+        """Go on with an action and what is seen after it. Returns False where that contradicts the sketch, which is of no use from then on."""
         here = self.labels[-1]
         there = self._links.get((here, action.name))
         try:
@@ -144,6 +144,7 @@ class Sketch:
         return self._turn(here, action, step)
 
     def _turn(self, here: int, action: Action, step: Step) -> int:
+        """The dstate that a turn leads to which was never tried in this one."""
         s = self._states[here]
         around = action.turn == "around"
         heading = (s.heading + QUARTERS[action.turn]) % 4
@@ -159,22 +160,23 @@ class Sketch:
         if around:
             self._turned_around(here, there)
         elif s.path is not None and self._states[there].path is not None:
-            self._doubt()
+            self._doubt_if_grown_from_map()
         if self._theory.all_on_paths:
             self._find_course(there)
         return there
 
     def _turned_around(self, here: int, there: int) -> None:
-        """A turn around links two dstates: what one's course is, the other's is in reverse."""
+        """Note that a turn around links two dstates: if one of them has a course, the other has its reverse."""
         self._states[here].reverse.append(there)
         self._states[there].reverse.append(here)
         for s in (self._states[here], self._states[there]):
             if s.path is not None:
-                self._doubt()
+                self._doubt_if_grown_from_map()
                 for x in s.reverse:
                     self._set_course(x, s.path, -s.direction)
 
     def _travel(self, here: int, step: Step) -> int:
+        """The dstate that a travel leads to which was never tried in this one."""
         path, direction = self._find_course(here)
         place, order = self._states[here].place, self._orders[path]
         position = order.index(place)
@@ -190,7 +192,7 @@ class Sketch:
         return there
 
     def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
-        """The dstate at a place on the path that a travel would end at, if what is seen fits."""
+        """The dstate at which a travel along a path would end at a known place; None if what is seen does not fit the place."""
         there = self._along.get((place, path, direction))
         heading = 0
         if there is None and self._framed:
@@ -203,29 +205,29 @@ class Sketch:
         elif self._states[there].seen != observation(step, self._theory):
             return None
         else:
-            self._doubt()
+            self._doubt_if_grown_from_map()
         self._set_course(there, path, direction)
         return there
 
     def _find_course(self, here: int) -> tuple[int, int]:
-        """The path and direction of a dstate; where it has none, the one that leaves through its slot, or a new path."""
+        """The path and direction of a dstate. A dstate that has none gets the path that leaves through its slot, or a new path."""
         s = self._states[here]
         if s.path is None:
             path, direction = self._slots.get((s.place, s.heading), (len(self._orders), 1))  # without frames there are no slots
             if path < len(self._orders) or not self._framed:
-                self._doubt()
+                self._doubt_if_grown_from_map()
             if path == len(self._orders):
                 self._orders.append([s.place])
             self._set_course(here, path, direction)
             return path, direction
         return s.path, s.direction
 
-    def _doubt(self) -> None:
-        """What was done may be the first to join two streets that the map knew."""
+    def _doubt_if_grown_from_map(self) -> None:
+        """Note that the last action may be the first to join two paths of the map that the sketch began with. A sketch that is a tree stays certain."""
         self.certain = self._tree
 
     def _set_course(self, here: int, path: int, direction: int) -> None:
-        """Give a dstate its course, and in reverse those that a turn around links it to."""
+        """Give a dstate its course, and the reverse of it to all dstates that turns around link it to."""
         s = self._states[here]
         if (s.path, s.direction) == (path, direction):
             return
@@ -248,13 +250,13 @@ class Sketch:
         assert step.view is not None
         if self._star(step, heading) != self._stars[place]:
             raise _Contradiction
-        self._states.append(_State(step.view, observation(step, self._theory), place, heading))
+        self._states.append(_Known(step.view, observation(step, self._theory), place, heading))
         if self._framed:
             self._facing[place, heading] = len(self._states) - 1
         return len(self._states) - 1
 
     def _star(self, step: Step, heading: int) -> object:
-        """The star of a place where this is seen: in its frame, if it has one."""
+        """The star of a place at which this is seen with this heading, in the frame of the place if it has one."""
         star = step.openings if self._theory.star != "none" else None
         if self._framed and star is not None:
             return tuple(star[(slot - heading) % 4] for slot in range(4))
@@ -265,10 +267,11 @@ class Sketch:
             raise _Contradiction
 
     def _made(self, labels: tuple[int, ...]) -> SSHMap:
+        """The sketch as a map, made anew."""
         links = tuple(sorted((s, action, x) for (s, action), x in self._links.items()))
         if self._theory.level == "causal":
             return SSHMap(labels, tuple(DState(i, s.view) for i, s in enumerate(self._states)), links)
-        first: dict[int, tuple[int, int]] = {}  # of each path: its number, and the direction that is faced first
+        first: dict[int, tuple[int, int]] = {}  # for each path, its number in the map, and the direction that is faced first
         for s in self._states:
             if s.path is not None:
                 first.setdefault(s.path, (len(first), s.direction))

@@ -8,11 +8,12 @@
 >>> check(trace, SSHMap((0, 0), (DState(0, "a"),), ((0, "travel", 0),)), Theory.causal())
 (Violation(axiom='functional_view', steps=(0, 1), message="Dstate 0 looks like 'a' at step 0 and like 'b' at step 1."),)
 
-The axioms are those of docs/theory.md, after Kuipers & Beeson (AAAI 2002) and Remolina & Kuipers (AIJ 2004). A map shows the
-places, the courses (path and direction), the headings and the orders, so an axiom about these is judged as the map shows them.
-A dstate shows one place, course and heading, also where an axiom is left out that forbids several; the others are judged by the one.
-The map does not show the sides of the paths: a place that comes to lie where it cannot is reported under each axiom that it takes
-to put it there, for dropping any one of them would mend it. A ring of travels, that no order can show, is reported likewise.
+The axioms are those of docs/theory.md, after Kuipers & Beeson (AAAI 2002) and Remolina & Kuipers (AIJ 2004). A map shows
+places, courses (path and direction), headings and orders, so an axiom about these is judged by what the map shows.
+A dstate of a map shows one place, one course and one heading, even where a theory leaves out the axiom that forbids several of them;
+all other axioms are judged by the ones shown. The map does not show the sides of paths. So a place that the axioms put on a side where it
+cannot be is reported under each axiom that takes part in putting it there, as dropping any one of them would mend it. A ring of
+travels, which no order can show, is reported in the same way.
 """
 
 from __future__ import annotations
@@ -59,12 +60,12 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
 
     Returns
     -------
-    The violations of all axioms but those that `unchecked` names: first those of `map_explains_trace` (the map fits the trace, and its numbers fit each other), then
-    those of the axioms in the order of the theory.
+    The violations of all axioms but those that `unchecked` names. Those of `map_explains_trace` come first (the map fits the trace, and its numbers fit each
+    other), then those of the axioms in the order of the theory.
 
     Raises
     ------
-    TraceError, TheoryError where the trace lacks what the theory asks for; nothing on account of the map.
+    TraceError and TheoryError where the trace lacks what the theory asks for. Nothing in the map makes it raise.
 
     References
     ----------
@@ -77,7 +78,7 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
 
 
 def unchecked(theory: Theory) -> tuple[str, ...]:
-    """What a theory asks for that the checker knows nothing of: axioms of the user's own rules, and rules without a name."""
+    """What a theory asks for and the checker cannot judge: axioms of the user's own rules, and files of rules that name no axiom."""
     named = tuple(name for name in theory.axioms if name not in AXIOMS)
     return named + tuple(f"the rules of {rules.name}" for rules in theory.rules if not rules.axioms)
 
@@ -104,7 +105,7 @@ class _Move:
 
 @dataclass(frozen=True)
 class _Branch:
-    """At a place, `branch` leaves to the right of `course`: because of a turn, or, if mirrored, by the symmetry of one."""
+    """At a place, `branch` leaves to the right of `course`. A turn shows that; if `mirrored`, it follows from what the turn shows by symmetric_sides."""
 
     place: int
     course: Course
@@ -132,10 +133,10 @@ class _Conflict:
 
 
 class _Order:
-    """The order of the places of one path: the one that the map lists if it is total, else the least one that the travels ask for.
+    """The order of the places of one path: the order that the map lists if it has to be total, else the least order that the travels ask for.
 
-    Directions are +1 and -1. No list can show an order that is not asymmetric or not transitive, so where one of these axioms is
-    left out, the travels go before the list. Without on_path no places are on the path, and a total order orders none.
+    Directions are +1 and -1. No list can show an order that is not asymmetric or not transitive. So where one of these axioms is
+    left out, what the travels say outweighs the list. Without the axiom on_path no place is known to be on the path, so a total order orders none.
     """
 
     def __init__(self, listed: Sequence[int], travels: Mapping[tuple[int, int], _Move], axioms: frozenset[str]) -> None:
@@ -152,7 +153,7 @@ class _Order:
         self.is_listed = self.total and (self.can_be_listed or not self.backward)
 
     def _rings(self) -> list[list[int]]:
-        """Places that the travels lead round in a ring. Every ring goes against the list somewhere, so we start there."""
+        """Rings of places that travels lead round. Each ring has a travel that goes against the list, so rings are sought from these travels on."""
         try:
             TopologicalSorter(self.next[1]).prepare()
         except CycleError:
@@ -165,7 +166,7 @@ class _Order:
         return not self.asymmetric or (not self.transitive and len(ring) > 2)
 
     def after(self, p: int, direction: int) -> Iterable[int]:
-        """The places after p."""
+        """The places after p, for somebody who goes in this direction."""
         if self.is_listed:
             return self._later(p, direction)
         follows = self._follows(p, direction)
@@ -180,14 +181,14 @@ class _Order:
         return reached
 
     def between(self, p: int, q: int, direction: int) -> set[int]:
-        """The places after p and before q."""
+        """The places after p and before q, for somebody who goes in this direction."""
         i, j = self.position.get(p), self.position.get(q)
         if (self.is_listed or not self.backward) and i is not None and j is not None and abs(i - j) <= 1:
-            return set()  # what the list does not have between them, the order does not; this spares the walk along the path
+            return set()  # neighbours in the list have nothing between them, and to see that here spares a walk along the path
         return set(self.after(p, direction)) & set(self.after(q, -direction)) - {p, q}
 
     def way_back(self, p: int, q: int) -> list[int]:
-        """The shortest way along the travels from q to p, both included; empty if there is none."""
+        """The places on a shortest way along travels from q to p, both included; empty if there is none."""
         came: dict[int, int | None] = {q: None}
         queue = deque([q])
         while queue and p not in came:
@@ -207,21 +208,23 @@ class _Order:
         return [step for edge in zip(ring, [*ring[1:], ring[0]], strict=True) for step in self.travels[edge].steps]
 
     def _later(self, p: int, direction: int) -> Sequence[int]:
+        """The places after p in the list."""
         i = self.position.get(p)
         if i is None:
             return ()
         return self.listed[i + 1 :] if direction == 1 else self.listed[:i]
 
     def _follows(self, p: int, direction: int) -> list[int]:
+        """The places that a travel or, if the order is total, the list puts after p; where they disagree, the travel counts."""
         travelled = self.next[direction].get(p, {})
         later = self._later(p, direction) if self.total else ()
         return [*travelled, *(q for q in later if q not in travelled and p not in self.next[direction].get(q, ()))]
 
 
 class _Reading:
-    """The trace in the terms of the map. Each distinct observation and link is kept once, with its first step.
+    """The trace in the terms of the map. Each distinct observation and link is kept once, with the first step that shows it.
 
-    Labels of dstates that the map does not have are left to `map_explains_trace`; the axioms pass over them.
+    Steps labelled with dstates that the map does not have are reported by `map_explains_trace`, and the axioms pass over them.
     """
 
     def __init__(self, trace: Trace, ssh_map: SSHMap, theory: Theory) -> None:
@@ -281,7 +284,7 @@ class _Reading:
 
     @cached_property
     def along(self) -> dict[int, dict[int, int]]:
-        """For each path, the places that a dstate is along it at, and that dstate's id."""
+        """For each path, the places at which a dstate is along it, and the id of that dstate."""
         found: dict[int, dict[int, int]] = defaultdict(dict)
         for s in self.states.values():
             if (course := _course(s)) and s.place is not None:
@@ -310,14 +313,14 @@ class _Reading:
         return found
 
     def on(self, path: int) -> set[int]:
-        """The places on a path, as the map lists them and as on_path says; without it nothing puts a place on a path."""
+        """The places on a path: those that the map lists, and those that on_path puts there. Without on_path no place has to be on a path."""
         if "on_path" not in self.axioms or path not in self.orders:
             return set()
         return {*self.orders[path].listed, *self.along.get(path, ())}
 
     @cached_property
     def branches(self) -> list[_Branch]:
-        """What leaves to the right of what, at which place. What a turn says itself comes before what symmetry adds."""
+        """Which course leaves to the right of which other one, at which place. What turns show comes before what symmetry adds."""
         if "branch_side" not in self.axioms:
             return []
         found: dict[tuple[int, Course, Course], _Branch] = {}
@@ -349,7 +352,7 @@ class _Reading:
 
     @cached_property
     def conflicts(self) -> list[_Conflict]:
-        """The places that the sides put where they cannot be."""
+        """The places that the axioms of the sides put where they cannot be."""
         disjoint = _both_sides(self) if "sides_disjoint" in self.axioms else ()
         between = _on_and_beside(self) if "path_between_sides" in self.axioms else ()
         return [*disjoint, *between]
@@ -412,7 +415,7 @@ def _is_pair(pair: object) -> bool:
 
 
 def _labels_are_dstates(m: _Reading) -> Found:
-    """A label a step, each the id of a dstate."""
+    """Each step has a label, and each label is the id of a dstate."""
     steps, labels = len(m.trace), len(m.map.labels)
     if steps != labels:
         yield [min(steps, labels)] if labels < steps else [], f"The map labels {labels} steps, but the trace has {steps}."
@@ -422,7 +425,7 @@ def _labels_are_dstates(m: _Reading) -> Found:
 
 
 def _numbered_by_first_visit(m: _Reading) -> Found:
-    """dstates, places and paths are all visited, are numbered 0, 1, 2, … by first visit, and a path is first faced in direction +1."""
+    """All dstates, places and paths are visited, are numbered 0, 1, 2, … by first visit, and each path is first faced in direction +1."""
     yield from _numbered("dstates", [s.id for s in m.map.dstates], [(i, s.id) for i, s in m.visited])
     if m.theory.level == "causal":
         return
@@ -453,7 +456,7 @@ def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | N
 
 
 def _dstates_look_as_seen(m: _Reading) -> Found:
-    """A dstate has the view of the step at which it is first visited; functional_view answers for the others."""
+    """A dstate has the view of the step at which it is first visited. The views of its other steps are judged under functional_view."""
     for i, s in m.visited:
         if s.view != m.trace.steps[i].view:
             yield [i], f"Dstate {s.id} has the view {s.view!r} in the map, but looks like {m.trace.steps[i].view!r} at step {i}."
@@ -471,7 +474,7 @@ def _links_are_those_of_the_trace(m: _Reading) -> Found:
 
 
 def _has_what_the_theory_has(m: _Reading) -> Found:
-    """No places and paths at the causal level, no headings without frames, no excuses where nothing is a default."""
+    """The map has no places and paths at the causal level, no headings without frames, and no excuses unless boundary=defeasible."""
     causal = m.theory.level == "causal"
     if causal and (m.map.places or m.map.paths):
         yield [], "The map has places or paths, but the theory is causal."
@@ -492,7 +495,7 @@ def _excused_are_pairs_of_paths(m: _Reading) -> Found:
 
 
 def _orders_list_places_once(m: _Reading) -> Found:
-    """The order of a path lists places of the map, none twice; on_path answers for which ones."""
+    """The order of a path lists places of the map, none twice. Whether they are the right places is judged under on_path."""
     places = set(m.map.places)
     for h in m.map.paths:
         if len(set(h.order)) < len(h.order):
@@ -703,7 +706,7 @@ def _course_needs_travel(m: _Reading) -> Found:
 
 
 def _sides(name: str, m: _Reading) -> Found:
-    """The axioms of right and left (B1 to B4): by a turn a branch has a side, and the places ahead on it, and sides exclude each other."""
+    """The axioms of right and left (B1 to B4): a turn puts a branch on a side, the places ahead on the branch are on that side, and sides exclude each other."""
     for conflict in m.conflicts:
         if name in conflict.axioms:
             yield conflict.steps, conflict.message
@@ -751,7 +754,7 @@ def _turn_rotates(m: _Reading) -> Found:
     for t in m.turns:
         before, after = _heading(t.source), _heading(t.target)
         if before is None or after is None or t.action.turn is None or t.source.place != t.target.place:
-            continue  # headings at two places are in two frames; turn_stays answers for that
+            continue  # headings at two places are in two frames; a turn between places is reported under turn_stays
         if (before + QUARTERS[t.action.turn]) % 4 != after:
             yield t.steps, f"{t} is a turn {t.action.turn}, but leads from heading {before} to heading {after}."
 
@@ -791,7 +794,7 @@ def _path_goes_straight(m: _Reading) -> Found:
 
 
 def _asserted(m: _Reading) -> Found:
-    """What somebody says of pairs of steps is so."""
+    """What somebody asserts of pairs of steps holds in the map."""
     labels, theory = m.map.labels, m.theory
     told = [("one dstate", theory.same), ("different dstates", theory.different), ("at different places", theory.elsewhere)]
     for said, (i, j) in ((said, pair) for said, pairs in told for pair in pairs if max(pair) < len(labels)):

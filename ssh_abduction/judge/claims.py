@@ -21,18 +21,21 @@ STATUSES = ("optimal", "feasible", "unsatisfiable", "unknown")
 
 
 def false_claims(answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int) -> tuple[str, ...]:
-    """What is wrong with the claims of an answer, as `solve --json` prints it (docs/formats.md), a sentence each. Nothing of it is believed.
+    """What is wrong with the claims of an answer, a sentence each. None of the claims is taken for granted.
 
+    answer  as `solve --json` prints it (docs/formats.md)
     maps    the maps that it lists
     steps   how many steps the trace has
     theory  the theory that the answer is of, resolved
-    proven  the number of dstates that its certificate proves, with clingo's verdict
+    proven  the number of dstates that its certificate proves, if clingo's part in it is believed
     """
     claims = _Claims(answer, maps, steps, theory, proven)
     return tuple(fault for check in (claims.sizes, claims.twice, claims.status, claims.cost, claims.bound) for fault in check())
 
 
 class _Claims:
+    """The claims of an answer. Each method yields what is wrong with some of them."""
+
     def __init__(self, answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int) -> None:
         self.answer, self.maps, self.steps, self.theory, self.proven = answer, maps, steps, theory, proven
         self.counts = [_counts(ssh_map) for ssh_map in maps]
@@ -40,7 +43,7 @@ class _Claims:
         self.is_optimal = answer.get("status") == "optimal"
 
     def sizes(self) -> Iterator[str]:
-        """How many steps and maps there are."""
+        """The claimed numbers of steps and maps are right."""
         listed = len(self.maps)
         if "count" in self.answer and not _is(self.answer["count"], listed):
             yield f"count: expected {listed}, as so many maps are listed, got {brief(self.answer['count'])}"
@@ -59,7 +62,7 @@ class _Claims:
                 yield f"maps: expected each map once, got maps {first + 1} and {i + 1}, which are the same up to renaming"
 
     def status(self) -> Iterator[str]:
-        """What is said to be known, and why the search ended."""
+        """The status, whether the list is complete, and why the search ended fit together and fit the maps."""
         status, complete, stopped = (self.answer.get(name) for name in ("status", "complete", "stopped"))
         if "status" in self.answer:
             if status not in STATUSES:
@@ -81,7 +84,7 @@ class _Claims:
             yield "complete: expected true, as the status is unsatisfiable, got false"
 
     def cost(self) -> Iterator[str]:
-        """The counts of the first map, and that the others are as good."""
+        """The claimed cost is that of the first map, and the other maps are as good."""
         if "cost" in self.answer:
             cost = self.answer["cost"]
             expected = {k: v for k, v in self._least(cost).items() if v or k != "excuses"} if self.maps else None
@@ -90,7 +93,7 @@ class _Claims:
                 because = "as map 1 has these" if self.maps else "as there is no map"
                 yield f"cost: expected {_text(expected)}, {because}, got {_text(cost)}"
         if self.theory.without:
-            return  # the maps need not show the counts of what they are not bound to
+            return  # where axioms are left out, clingo may count more than the maps show
         best = [counts[name] for counts in self.counts[:1] for name in self.theory.priorities]
         for i, counts in enumerate(self.counts):
             here = [counts[name] for name in self.theory.priorities]
@@ -99,7 +102,7 @@ class _Claims:
                 yield f"maps: expected equal numbers of {preferred}, as minimal maps have, got {best} in map 1 and {here} in map {i + 1}"
 
     def _least(self, cost: Any) -> dict[str, int]:
-        """The counts of the first map. Where axioms are left out, clingo may count more of what is preferred than the map can show."""
+        """The counts of the first map. Where axioms are left out, clingo may count more than the map can show, so a larger claim is accepted."""
         shown = self.counts[0]
         if not self.theory.without or not isinstance(cost, Mapping):
             return shown
@@ -107,7 +110,7 @@ class _Claims:
         return shown | more
 
     def bound(self) -> Iterator[str]:
-        """Lower bounds: no map is below one, the certificate bears out the one on dstates, and a proof leaves nothing between bound and cost."""
+        """No map is below a claimed bound, the certificate proves the bound on dstates, and where the status is optimal the bound is the cost."""
         bound = self.answer.get("bound", {})
         if not isinstance(bound, Mapping) or not all(name in COUNTS and is_whole(value) and value >= 0 for name, value in bound.items()):
             yield f"bound: expected numbers of {', '.join(COUNTS)}, got {brief(bound)}"

@@ -20,7 +20,12 @@ from ssh_abduction.trace import Trace
 
 @dataclass(frozen=True, slots=True)
 class ProvenBound:
-    """What a certificate proves: so many dstates at least, and what is wrong with it. `refuted` is clingo's word, which is not checked here."""
+    """What a certificate proves.
+
+    dstates  every map has at least so many, if there are no faults
+    refuted  the numbers of dstates above that for which clingo found no map; this is taken on its word, and not checked here
+    faults   what is wrong with the certificate
+    """
 
     dstates: int
     refuted: tuple[int, ...]
@@ -30,9 +35,9 @@ class ProvenBound:
 def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
     """Check the certificate of a lower bound on dstates, as `Certificate.to_dict` wrote it.
 
-    Steps that the same actions lead to different views from are different dstates, as a dstate has one view and actions are
-    deterministic. So each pair of the clique is followed along the trace; where the certificate has no words at all, as far as the same was done.
-    Raises MapError where the certificate is malformed.
+    Two steps are different dstates if the same actions lead from them to different views, as a dstate has one view and actions are
+    deterministic. So each pair of the clique is followed along the trace by its word, to see whether the views differ. Where the certificate has no words at
+    all, the word of a pair is what was done after both steps. Raises MapError where the certificate is malformed.
     """
     if not isinstance(certificate, Mapping):
         raise MapError(f"certificate: expected an object, got {brief(certificate)}; solve the trace again with --json")
@@ -60,7 +65,7 @@ def _integers(values: Any) -> bool:
 
 
 def _common_actions(trace: Trace, i: int, j: int) -> list[str]:
-    """What was done after both steps until the views differ, or the actions do, or the trace ends: the word, where a certificate has none."""
+    """The actions done after both steps, until the views differ, the actions differ, or the trace ends: the word of a pair if a certificate has no words."""
     word: list[str] = []
     for here, there in zip(trace.steps[i:], trace.steps[j:], strict=False):
         if here.view != there.view or here.action is None or there.action is None or here.action.name != there.action.name:
@@ -70,7 +75,7 @@ def _common_actions(trace: Trace, i: int, j: int) -> list[str]:
 
 
 def _not_apart(trace: Trace, i: int, j: int, word: Sequence[str]) -> str | None:
-    """Why these actions do not show that the steps are different dstates, if so."""
+    """Why these actions do not show that the steps are different dstates; None if they do."""
     for k, name in enumerate(word):
         for step in (i + k, j + k):
             action = trace.steps[step].action if step < len(trace) else None

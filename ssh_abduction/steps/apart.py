@@ -26,8 +26,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-COMPARED = 8000  # steps of a trace, at most, for which what evidence excludes is a matrix; it has the square of that many bytes
-SWAPS = 60  # attempts to better the clique of a view, at most; fewer where it has few steps
+# Up to this many steps, the pairs that evidence excludes are spread to earlier steps in a matrix of steps x steps, which takes 64 MB then. In a longer trace
+# only the pairs that evidence names are excluded.
+COMPARED = 8000
+# A greedy clique of one view is improved by at most this many swaps, and by an eighth as many as steps show the view, if these are fewer: each swap takes as
+# long as growing a clique anew, and the clique has to be there before clingo is asked anything.
+SWAPS = 60
 
 Matrix = NDArray[np.bool_]
 
@@ -43,32 +47,32 @@ class Continuations:
         """
         seen      what was seen at each step
         actions   what was done after each step but the last, numbered from 0
-        excluded  pairs of steps that are not one dstate, as evidence says; so are the steps from which the same actions lead to such a pair
+        excluded  pairs of steps that evidence keeps from being one dstate. Steps from which the same actions lead to such a pair are not one either
         """
         shown, done = np.asarray(seen), np.append(np.asarray(actions, dtype=int), -1) + 1
         steps = len(shown)
         self._seen = seen
         self._excluded = _spread(excluded, done) if excluded and steps <= COMPARED else None
-        self._partners: dict[int, list[int]] = {}  # of a trace that is too long for that, as they are given
+        self._partners: dict[int, list[int]] = {}  # the excluded steps of each step, where the trace is too long for a matrix
         for i, j in excluded if self._excluded is None else ():
             self._partners.setdefault(i, []).append(j)
             self._partners.setdefault(j, []).append(i)
-        ranks = [_ranked(shown * (done.max() + 1) + done)]  # by the first 1, 2, 4, … views and actions
+        ranks = [_ranked(shown * (done.max() + 1) + done)]  # the order of the steps by their first 1, 2, 4, … views and actions
         while ranks[-1].max() < steps - 1:
             then = np.zeros(steps, dtype=int)
             ahead = 1 << (len(ranks) - 1)
             then[:-ahead] = ranks[-1][ahead:] + 1
             ranks.append(_ranked(ranks[-1] * (steps + 1) + then))
-        self._place = ranks[-1]  # of each step, among those sorted
+        self._place = ranks[-1]  # the position of each step in the sorted order
         self._sorted = np.argsort(self._place)
         here, there = self._sorted[:-1], self._sorted[1:]
-        for level in range(len(ranks) - 2, -1, -1):  # to where they differ
+        for level in range(len(ranks) - 2, -1, -1):  # both neighbours go on, by halving strides, to where they differ
             ahead = (ranks[level][here] == ranks[level][there]) * (1 << level)
             here, there = here + ahead, there + ahead
         self._shared = 2 * (here - self._sorted[:-1]) + (shown[here] == shown[there])  # views and actions that neighbours have in common
 
     def apart_from(self, step: int, actions: int = 0) -> Matrix:
-        """Which steps are apart from this one, so that it takes so many actions, at least, to see that: a row of `apart`."""
+        """Which steps are apart from this one, and show it only after at least this many actions. With 0 it is the step's row of `apart`."""
         place, steps = self._place[step], len(self._place)
         shared = np.empty(steps, dtype=int)
         shared[:place] = np.minimum.accumulate(self._shared[:place][::-1])[::-1]
@@ -100,7 +104,7 @@ class Continuations:
 
         Evidence leaves no tree of groups: with it, the clique is the larger one of that and of one that is found greedily.
         """
-        # Of groups that go on, each within the one before, what its steps have in common, and its clique so far:
+        # The groups that the current step is in, each within the one before: how much its steps have in common, and its largest clique so far.
         begun: list[tuple[int, _Clique]] = []
         for step, shared in zip(self._sorted.tolist(), [*self._shared.tolist(), -1], strict=True):
             so_far = _Clique((step,), 0, 1)
@@ -128,8 +132,8 @@ def _spread(excluded: Collection[tuple[int, int]], done: NDArray[np.int_]) -> Ma
 class _Clique:
     """A largest clique of some group of steps.
 
-    apart  from how many steps of the group its steps are apart, in all
-    group  how many steps that has
+    apart  the sum, over the steps of the clique, of how many steps of the group each is apart from
+    group  the number of steps in the group
     """
 
     steps: tuple[int, ...]
@@ -137,7 +141,7 @@ class _Clique:
     group: int
 
     def joined(self, other: _Clique, *, apart: bool) -> _Clique:
-        """A largest clique of two groups together; all steps of the one are apart from all of the other, or none are."""
+        """A largest clique of two groups together. Either all steps of one group are apart from all of the other (`apart`), or none are."""
         group = self.group + other.group
         if apart:
             more = len(self.steps) * other.group + len(other.steps) * self.group
@@ -147,50 +151,50 @@ class _Clique:
 
 
 def _ranked(keys: NDArray[np.int_]) -> NDArray[np.int_]:
-    """The number of each key among all there are, by size."""
+    """The rank of each key: keys are numbered by size, and equal keys share a number."""
     return np.unique(keys, return_inverse=True)[1]
 
 
 def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
-    """A large clique of nodes, in order, whatever tells them apart. As nodes with different views always are, each view has a clique of its own."""
+    """A large clique of nodes, in order. Nodes with different views are always apart, so it is put together from one clique for each view."""
     shown = np.asarray(seen)
     found: list[int] = []
     for view in range(int(shown.max()) + 1):
         steps = np.flatnonzero(shown == view)
-        found += [int(steps[i]) for i in _clique(apart[np.ix_(steps, steps)])]
+        found += [int(steps[i]) for i in _greedy_clique(apart[np.ix_(steps, steps)])]
     return sorted(found)
 
 
 def large_clique(apart: Matrix) -> list[int]:
-    """A large clique of a few nodes: the largest of those that are found greedily from each node on."""
+    """A large clique of few nodes: from each node a clique is grown greedily, and the largest of these is returned."""
     random = np.random.default_rng(0)
-    found = [_filled(apart, [node], random) for node in range(len(apart))]
+    found = [_grown(apart, [node], random) for node in range(len(apart))]
     largest: list[int] = max(found, key=len, default=[])
     return sorted(largest)
 
 
-def _clique(apart: Matrix) -> list[int]:
-    """Greedily the step that is apart from most of those left, then swaps: take some out, fill up again, keep what is no smaller."""
+def _greedy_clique(apart: Matrix) -> list[int]:
+    """A clique grown greedily, then improved by swaps: some of its nodes are taken out, it is grown again, and kept unless it is smaller."""
     random = np.random.default_rng(0)
-    best = _filled(apart, [], random)
+    best = _grown(apart, [], random)
     for _ in range(min(SWAPS, len(apart) // 8) if 1 < len(best) < len(apart) else 0):
         kept = random.permutation(best)[random.integers(1, len(best)) :]
-        other = _filled(apart, kept.tolist(), random)
+        other = _grown(apart, kept.tolist(), random)
         best = other if len(other) >= len(best) else best
     return best
 
 
-def _filled(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:
-    """A clique that no step can be added to."""
+def _grown(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:
+    """A clique grown from these nodes, until no node can be added. The next node is always one that is apart from most of those left."""
     left = np.flatnonzero(apart[kept].all(axis=0)) if kept else np.arange(len(apart))
     found = list(kept)
     inner = apart[np.ix_(left, left)]
     degree = inner.sum(axis=0)
-    free = np.arange(len(left))  # of those left, the ones that are apart from all found
+    free = np.arange(len(left))  # the nodes that are apart from all nodes found so far
     while len(free):
         best = free[int((degree[free] + random.random(len(free))).argmax())]
         found.append(int(left[best]))
         stay = inner[best, free]
-        degree -= inner[free[~stay]].sum(axis=0)  # each is left out once, so a whole clique costs no more than the matrix is large
+        degree -= inner[free[~stay]].sum(axis=0)  # each node drops out once, so a clique takes no longer than reading the matrix
         free = free[stay]
     return found

@@ -20,7 +20,9 @@ from ssh_abduction.steps.noise import Noise, noise_in
 from ssh_abduction.trace import Trace
 
 RESTS_ON = frozenset({"functional_view", "deterministic"})  # the axioms that make apart steps different dstates
-WRITTEN = 500_000  # actions of words, at most; of steps that all look alike for long they grow with the cube of the steps, and whoever checks can find them
+# A certificate in a file has its words only if they have at most this many actions in all, some megabytes. Where steps look alike for long, words grow with
+# the cube of the trace; and whoever checks the certificate can find them anew.
+WRITTEN = 500_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class Certificate:
         return {pair: _word(trace, *pair) for pair in combinations(self.clique, 2)}
 
     def to_dict(self, trace: Trace) -> dict[str, Any]:
-        """Plain data. Pairs that show different views at once need no word, and are left out; so are all words, where they have more than WRITTEN actions."""
+        """Plain data. Pairs that show different views at once need no word and are left out. Words of more than WRITTEN actions in all are left out, too."""
         words: list[list[Any]] = []
         written = 0
         for i, j in combinations(self.clique, 2):
@@ -58,11 +60,11 @@ class Certificate:
 
 @dataclass(frozen=True)
 class Basis:
-    """What a certificate is worked out from once it is asked for: a short trace is solved in the time that this takes.
+    """What a certificate is made of, once somebody asks for it: to make it takes as long as to solve a short trace.
 
-    views    what was seen at the first steps of the trace, and
-    actions  what was done, both as numbers
-    bound    so many dstates every map has, as far as is proven
+    views    what was seen at the first steps of the trace, as numbers
+    actions  what was done there, as numbers
+    bound    the proven least number of dstates
     """
 
     views: tuple[int, ...]
@@ -82,6 +84,7 @@ class Basis:
 
 
 def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:
+    """The common actions that lead from steps i and j to different views."""
     word: list[str] = []
     while True:
         here, there = trace.steps[i + len(word)], trace.steps[j + len(word)]

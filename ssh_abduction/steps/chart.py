@@ -55,7 +55,7 @@ class Chart:
     def of_steps(log: Log, size: int) -> Chart:
         """The chart of the first steps, each a node."""
         links = tuple((t, log.actions[t], t + 1) for t in range(size - 1))
-        return Chart(tuple(log.seen[:size]), links, range(size), excluded=frozenset(_among(log.pairs.apart, size)))
+        return Chart(tuple(log.seen[:size]), links, range(size), excluded=frozenset(_pairs_within(log.pairs.apart, size)))
 
     def apart(self) -> NDArray[np.bool_]:
         """Which pairs of nodes are apart: nodes x nodes."""
@@ -84,9 +84,9 @@ class Chart:
 
     @staticmethod
     def turned(trace: Trace, log: Log, size: int) -> FramedChart | None:
-        """The chart of the first steps, as if places had frames; what is seen ahead, right, back and left takes the place of stars.
+        """The chart of the first steps, as if places had frames. What is seen ahead, right, back and left takes the place of stars.
 
-        A guess: the causal theory does not say that turns rotate. None where some action is neither turn nor travel, or where
+        This is a guess, as the causal theory does not say that turns rotate. None where some action is neither turn nor travel, or where
         what is seen after a turn does not follow from what was seen before.
         """
         around = Chart.around(trace, log, size)
@@ -94,8 +94,8 @@ class Chart:
 
     @staticmethod
     def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]] | None:
-        """What is seen ahead, right, back and left where something is seen ahead, as turns show. None as `turned` says."""
-        after: dict[tuple[int, int], int] = {}  # what is seen, and quarters to the right: what is seen then
+        """For each observation, what is seen ahead, right, back and left of where it is seen ahead, as turns show. None as `turned` says."""
+        after: dict[tuple[int, int], int] = {}  # what is seen after a turn, by what was seen before it and the quarters to the right
         for action, before, then in zip(trace.actions[: size - 1], log.seen, log.seen[1:], strict=False):
             if action.kind is None:
                 return None
@@ -105,7 +105,7 @@ class Chart:
                     return None
         found: dict[int, list[int]] = {}
         for seen in dict.fromkeys(log.seen[:size]):
-            views = _around(seen, after)
+            views = _views_around(seen, after)
             if views is None:
                 return None
             found[seen] = views
@@ -115,7 +115,7 @@ class Chart:
     def framed(trace: Trace, log: Log, size: int | None = None, around: Mapping[int, Sequence[int]] | None = None) -> FramedChart | None:
         """The chart of the first steps (default all), where places have frames. None where some visit fits no frame: then there is no map.
 
-        around  what is seen ahead, right, back and left where something is seen ahead: in the place of stars
+        around  in the place of stars: for each observation, what is seen ahead, right, back and left of where it is seen ahead
         """
         size = len(trace) if size is None else size
         node: dict[tuple[int, int], int] = {}
@@ -145,8 +145,8 @@ class Chart:
         ]
         links = sorted([*travels, *rotations], key=lambda link: max(link[0], link[2]))
         facing = tuple(node)
-        away = {(node_of[i], node_of[j]) for i, j in _among(log.pairs.elsewhere, size)}
-        excluded = {(node_of[i], node_of[j]) for i, j in _among(log.pairs.apart, size)} - away
+        away = {(node_of[i], node_of[j]) for i, j in _pairs_within(log.pairs.elsewhere, size)}
+        excluded = {(node_of[i], node_of[j]) for i, j in _pairs_within(log.pairs.apart, size)} - away
         if any(i == j for i, j in excluded) or any(facing[i][0] == facing[j][0] for i, j in away):
             return None
         return FramedChart(
@@ -166,11 +166,11 @@ class Chart:
 class FramedChart(Chart):
     """A chart of visits.
 
-    facing   visit and slot of each node; a slot counts quarters clockwise from how the robot faced as it arrived
-    stars    what is open on each visit, by slot; or what is seen there
-    travels  the links that are travels, in order: the visit's number is that of the travel after it
+    facing     the visit and the slot of each node; a slot counts quarters clockwise from how the robot faced as it arrived
+    stars      what is open at each visit, by slot; or what is seen there, by slot
+    travels    the links that are travels, in order: travel V leads from visit V to visit V + 1
     elsewhere  pairs of nodes known to be at different places
-    away     those of them that evidence says
+    away       those of these pairs that evidence names
     """
 
     facing: tuple[tuple[int, int], ...]
@@ -184,15 +184,14 @@ class FramedChart(Chart):
         return replace(self, elsewhere=self.elsewhere | frozenset(more))
 
     def __getstate__(self) -> dict[str, object]:
-        """To another process goes what is given, and not the large arrays that were made of it."""
+        """What is sent to another process: the fields, without the large arrays that are computed from them."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def apart(self, most: int | None = None, others: Sequence[int] | None = None) -> NDArray[np.bool_]:
-        """Which pairs of nodes, of the first `most` if so many are given, are apart, or which of them and these others, nodes x others:
-        no frame has both visits so turned that the two nodes are one dstate.
+        """Which pairs of nodes are apart: nodes x others. Two nodes are apart if their visits misfit when turned so that the two nodes face one slot.
 
-        From the last visit to the first: visits do not fit if they show different things, or if the same action,
-        done facing the same way, leads to visits that do not fit as they are.
+        most    only the first so many nodes (default all)
+        others  the nodes that they are compared with (default the same ones)
         """
         import numpy as np
 
@@ -210,11 +209,11 @@ class FramedChart(Chart):
 
     @cached_property
     def leaves(self) -> dict[int, tuple[int, int]]:
-        """The slot that a visit ends at, and the action there, which leads to the next visit."""
+        """For each visit but the last, the slot that it ends at, and the action there, which leads to the next visit."""
         return {visit: (self.facing[node][1], action) for visit, (node, action, _) in enumerate(self.travels)}
 
     def turns(self, trace: Trace) -> list[tuple[int, str, int]]:
-        """Turns from node to node, each once, in the order of the trace."""
+        """The turns of the trace from node to node, as (node, direction, node), each once, in the order of the trace."""
         steps = zip(pairwise(self.node_of), trace.actions, strict=False)
         return list(dict.fromkeys((s, action.turn, x) for (s, x), action in steps if action.turn))
 
@@ -239,20 +238,23 @@ class FramedChart(Chart):
         )
 
     def visits_with(self, pairs: int) -> int:
-        """How many of the first visits have so many pairs, at most, that may be one."""
+        """The most visits, from the first on, among which at most so many pairs may be at one place."""
         import numpy as np
 
         return int(np.searchsorted(self.fitting, pairs, side="right")) - 1
 
     @cached_property
     def fitting(self) -> NDArray[np.int_]:
-        """How many pairs `fits` has of so many of the first visits, 0 to all; these may be too many to list."""
+        """For each number of visits, from 0 to all: how many pairs `fits` would list of that many first visits. There may be too many to list them."""
         import numpy as np
 
         return np.cumsum([0, *np.count_nonzero(np.triu(~self.misfits, 1), axis=(0, 1))])
 
     def fits(self, visits: Sequence[int]) -> list[tuple[int, int, int]]:
-        """Visits I < J of these, which are in order, that may be at one place, and R, where slot 0 of I is then slot R of J."""
+        """The pairs of these visits that may be at one place, as (I, J, R) with I < J: slot 0 of visit I is then slot R of visit J.
+
+        visits  in order
+        """
         import numpy as np
 
         some = np.asarray(visits)
@@ -261,7 +263,11 @@ class FramedChart(Chart):
 
     @cached_property
     def misfits(self) -> NDArray[np.bool_]:
-        """quarters x visits x visits: slot 0 of the first visit cannot be the slot of that number of the second."""
+        """R x I x J, for R in 0 to 3 and visits I and J: whether they cannot be at one place so that slot 0 of I is slot R of J.
+
+        Two visits misfit where they show different things, where evidence says so, or where the same action, done facing the same way, leads to visits that
+        misfit as they arrive. So this is worked out from the last visit to the first.
+        """
         import numpy as np
 
         visits = len(self.stars)
@@ -269,7 +275,7 @@ class FramedChart(Chart):
         for (visit, slot), seen in zip(self.facing, self.seen, strict=True):
             views[visit, slot] = seen
         number: dict[tuple[int, ...], int] = {}
-        # stars[r] is a number for each visit's star, as seen from its slot r
+        # stars[r] numbers the star of each visit as it looks from slot r of the visit
         stars = [np.array([number.setdefault(star[r:] + star[:r], len(number)) for star in self.stars]) for r in range(4)]
         leaves = np.full(visits, -1)  # the slot that a visit ends at, none for the last
         action = np.full(visits, -1)
@@ -295,8 +301,8 @@ class FramedChart(Chart):
         return misfits
 
 
-def _among(earlier: Earlier, size: int) -> list[tuple[int, int]]:
-    """The pairs of the first steps, the earlier step first."""
+def _pairs_within(earlier: Earlier, size: int) -> list[tuple[int, int]]:
+    """The pairs both steps of which are among the first `size`, the earlier step first."""
     return [(i, t) for t, others in earlier.items() if t < size for i in others]
 
 
@@ -306,10 +312,10 @@ def numbered(labels: Iterable[Hashable]) -> list[int]:
     return [number.setdefault(label, len(number)) for label in labels]
 
 
-def _around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int] | None:
-    """What is seen ahead, right, back and left where this is seen ahead. None where turns do not tell, or tell two things.
+def _views_around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int] | None:
+    """What is seen ahead, right, back and left of where this is seen ahead. None where turns do not tell, or contradict each other.
 
-    after  what is seen after a turn, by what was seen before and quarters to the right
+    after  what is seen after a turn, by what was seen before it and by how many quarters to the right it turned
     """
     views = {0: seen}
     waiting = [0]

@@ -15,9 +15,14 @@ from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Step, Trace
 
-TRIED = 100  # dstates of a view that a step may be merged with
-STEPS_TRIED = 3_000_000  # steps predicted in all, about a second, after which no step is merged with any, as the map is large anyway;
-EACH = 20  # or so many for each step, if that is more
+# Where the greedy map does not know an action, at most this many dstates of the view that is seen are tried as its end, those found first: so a view that is seen
+# nearly everywhere does not use up all predictions at once.
+TRIED = 100
+# To make a greedy map at most this many steps are predicted, which takes about a second. From then on what is unknown leads to new dstates: a map that takes more
+# predictions is large anyway.
+STEPS_TRIED = 3_000_000
+# Or this many predictions for each step of the trace, if that is more, so that a long trace is not cut short.
+EACH = 20
 
 
 class Outcome(Enum):
@@ -30,14 +35,15 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """`labels` of the steps explained, and the `outcome`. Where it is not PREDICTED, step len(labels) is the one that failed."""
+    """The `labels` of the steps that the map explains, and the `outcome`. Where that is not PREDICTED, step len(labels) is the one that failed."""
 
     labels: tuple[int, ...]
     outcome: Outcome
 
 
 def observation(step: Step, theory: Theory) -> tuple[object, object]:
-    """What the axioms read at a step: the view, with the star where the theory uses stars, in one rotation of four if any will do.
+    """What the axioms read at a step: the view, and the star where the theory uses stars. Where the theory does not say how stars are turned
+    (star=pattern), all four rotations of a star are the same observation.
 
     By functional_view and the axioms of the stars, a dstate has one observation.
     """
@@ -63,9 +69,10 @@ class Log:
         self.seen = [seen.setdefault(observation(step, theory), len(seen)) for step in trace.steps]
 
     def replay(self, labels: Sequence[int], known: int | None = None, place_of: Sequence[int | None] | None = None) -> Replay:
-        """Replay the trace over the map that `labels` make of its first steps; `known` of them make links (default all).
+        """Replay the trace over the map that `labels` make of its first steps.
 
-        place_of  the place of each dstate of the map, if it has any: what evidence says of pairs of steps may be about these
+        known     how many of these steps make the links of the map (default all)
+        place_of  the place of each dstate of the map, if it has places: evidence may say that two steps are at different places
         """
         actions, seen = self.actions, self.seen
         known = len(labels) if known is None else known
@@ -93,17 +100,18 @@ class Log:
         return Replay(tuple(found), outcome)
 
     def merged(self) -> tuple[int, ...]:
-        """Labels of a map of the whole trace, made greedily: not minimal, but at once.
+        """Labels of a map of the whole trace, made greedily: it is consistent and found at once, but need not be minimal.
 
-        Wherever the map does not know an action, the dstate among those that show what is seen is taken that then predicts most, if it
-        is not contradicted before the map knows no more; else a new one, as all are once much was tried. So a link, once made, is never wrong.
+        Where the map does not know an action, each known dstate that shows what is seen is tried as its end: from there the map either predicts the trace
+        until it meets another unknown action, or is contradicted before. Of those not contradicted, the one that predicts most steps is taken; if there is
+        none, the action leads to a new dstate. So a link, once made, is never wrong. Once STEPS_TRIED is used up, all that is unknown leads to new dstates.
         """
         actions, seen = self.actions, self.seen
         shows = [seen[0]]
-        like = {seen[0]: [0]}  # the first dstates that show a view: as many as are tried
+        like = {seen[0]: [0]}  # for each observation, the first TRIED dstates that show it
         links: dict[tuple[int, int], int] = {}
         labels = [0]
-        left = max(STEPS_TRIED, EACH * len(seen))  # steps to be predicted
+        left = max(STEPS_TRIED, EACH * len(seen))  # predictions that may still be made
         while len(labels) < len(seen):
             t = len(labels)
             key = (labels[-1], actions[t - 1])

@@ -1,9 +1,9 @@
 """The step at which a trace looks like noise: because of it alone, nearly all steps before it are dstates of their own.
 
-A robot that goes round in circles learns no new dstate, as each circuit shows what the ones before did. One wrong view, or one step left out of the log, and
-each step of all circuits before is told apart from all others by how far it is from there: the map has as many dstates as the trace has steps, and the axioms allow no
-smaller one. That is seen without a map: of the steps up to there a largest clique of steps that are apart (apart.py) is nearly all of them, and of the
-steps before it was small. Where a robot explores, the clique grows with each new dstate, little by little.
+A robot that goes round in circles learns no new dstate, as each circuit shows what the ones before did. After one wrong view, or one step left out of the log,
+each step of all circuits before is told apart from all others by how far it is from there. So the map has as many dstates as the trace has steps, and the axioms
+allow no smaller one. That can be seen without a map: a largest clique of steps that are apart (apart.py) was small before that step, and with it is nearly all
+steps. Where a robot explores, the clique grows with each new dstate, little by little.
 
 >>> from ssh_abduction.steps.noise import noise_in
 >>> circuits = [0, 1, 2, 3] * 8
@@ -19,18 +19,22 @@ from dataclasses import dataclass
 
 from ssh_abduction.trace import Trace
 
-LEAST = 20  # steps of a trace, from which on it is asked
-NEARLY_ALL = 0.8  # share of the steps up to there that are dstates of their own
-FALL = 0.5  # share of them, at most, that are left without the step
+# No step looks like noise among the first so many steps, nor in a trace that is no longer: a robot that has just begun may well be somewhere new at each step.
+LEAST = 20
+# A step looks like noise only if because of it at least this share of the steps up to there have to be dstates of their own (nearly all of them).
+NEARLY_ALL = 0.8
+# And only if at most this share of those dstates is needed for the steps before it, and for the whole trace without it: one step that makes twice as many dstates
+# necessary stands out from a robot that explores, where each step adds one at most.
+FALL = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
     """A step that looks like noise.
 
-    step        that does
-    told_apart  how many of the steps up to there are dstates of their own, with it
-    without     how many of all steps have to be, if that step tells none of them apart
+    step        the number of the step
+    told_apart  how many of the steps up to this one have to be dstates of their own because of it
+    without     how many steps of the whole trace have to be dstates of their own if this step tells none of them apart
     """
 
     step: int
@@ -55,7 +59,8 @@ def noise_in(views: Sequence[int], actions: Sequence[int]) -> Noise | None:
     if len(views) <= LEAST:
         return None
     fewest = len(_clique(views, actions, len(views))) / 2
-    short, long = 0, len(views)  # the clique grows with the prefix: between these it comes to be more than half of what it is in the end
+    # The clique grows with the prefix. By bisection: the step with which it comes to be more than half of what it is in the end.
+    short, long = 0, len(views)
     while long - short > 1:
         middle = (short + long) // 2
         if len(_clique(views, actions, middle)) > fewest:
@@ -67,7 +72,7 @@ def noise_in(views: Sequence[int], actions: Sequence[int]) -> Noise | None:
     before, up_to_there = len(_clique(views, actions, short)), len(_clique(views, actions, long))
     if up_to_there < NEARLY_ALL * long or not 1 < before <= FALL * up_to_there:
         return None
-    without = len(_clique(views, _cut(actions, short), len(views)))
+    without = len(_clique(views, _cut_off(actions, short), len(views)))
     return Noise(short, up_to_there, without) if without <= FALL * up_to_there else None
 
 
@@ -78,7 +83,7 @@ def _clique(views: Sequence[int], actions: Sequence[int], steps: int) -> list[in
     return Continuations(views[:steps], actions[: steps - 1]).clique()
 
 
-def _cut(actions: Sequence[int], step: int) -> list[int]:
-    """Actions, of which those to and from a step are like no other: what was seen beyond them tells no steps apart."""
+def _cut_off(actions: Sequence[int], step: int) -> list[int]:
+    """The actions, where those to and from one step are made unlike all others. So what was seen at that step and beyond it tells no earlier steps apart."""
     other = max(actions, default=0) + 1
     return [other + t if t in (step - 1, step) else action for t, action in enumerate(actions)]

@@ -13,14 +13,19 @@ FIRST = ("causal", "topological", "boundary", "star")  # each needs those before
 _AXIOM = re.compile(r"^% @axiom\((?P<name>\w+)\) (?:(?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if (?P<when>.+))?|(?P<alone>.+))$")
 _WHEN = re.compile(r"^% @when (?P<when>.+)$")
 _KEEPS = re.compile(r"^% @keeps (?P<names>.+)$")
+_WITH = re.compile(r"^% @with (?P<names>.+)$")
 
 
 @dataclass(frozen=True)
 class Axiom:
-    """One axiom: its name, what it says, where it is from, its encoding's level, and the choices of a theory that switch it on.
+    """One axiom.
 
-    subject     the choices without which there is nothing that the axiom speaks of
-    conditions  those, and the ones that choose the axiom itself
+    name        as in `violation(name,…)`
+    sentence    what it says
+    source      where it is from
+    level       the name of its encoding
+    subject     the choices of a theory without which there is nothing that the axiom speaks of (`% @when`)
+    conditions  all choices that switch it on: those, and the ones after `if`
     """
 
     name: str
@@ -40,7 +45,7 @@ class Axiom:
 
 
 def _holds(condition: str, choices: Mapping[str, object]) -> bool:
-    """`field=value|value`, `field`, `field|field` where any of these will do, or `not field`."""
+    """Whether a condition holds: `field=value|value`, `field`, `field|field` (any of these fields), or `not field`."""
     if "=" in condition:
         field, values = condition.split("=")
         return choices[field] in values.split("|")
@@ -64,7 +69,7 @@ def path(name: str) -> str:
 
 @cache
 def levels() -> tuple[str, ...]:
-    """The encodings that hold axioms, in the order to load them: a file that is put into the folder is one of them."""
+    """The encodings that hold axioms, in the order to load them. They are found in the folder, so a file that is put there is one of them."""
     found = [file.stem for file in folder().glob("*.lp") if "\n% @axiom(" in file.read_text(encoding="utf-8")]
     return tuple(sorted(found, key=lambda name: (FIRST.index(name) if name in FIRST else len(FIRST), name)))
 
@@ -89,12 +94,27 @@ def axioms_in(text: str, level: str) -> list[Axiom]:
 
 
 def needed_by(choices: Mapping[str, object]) -> tuple[str, ...]:
-    """The encodings that a theory with these fields needs, in the order to load them: those of its axioms, also of axioms that it leaves out."""
+    """The encodings that a theory with these fields needs, in the order to load them: those of its axioms, axioms that it leaves out (`without`) among them."""
     return tuple(level for level in levels() if any(axiom.holds_in(choices) for axiom in axioms() if axiom.level == level))
 
 
 @cache
+def paths(name: str) -> tuple[str, ...]:
+    """The paths of all files that make the encoding `name`: its own, and before it those that it shares with another one, as `% @with` says at its head.
+
+    Clingo's `#include` is not used for that, as it prefers a file of the working directory which happens to have the same name.
+    """
+    own = path(name)
+    return (*(path(shared) for shared in _said(own, _WITH)), own)
+
+
+@cache
 def keeps(*names: str) -> frozenset[str]:
-    """The axioms that these fast encodings say at their heads that they keep, together."""
-    lines = [line for name in names for line in Path(path(name)).read_text(encoding="utf-8").splitlines()]
-    return frozenset(axiom for line in lines if (match := _KEEPS.match(line)) for axiom in match["names"].split())
+    """The axioms that these fast encodings say at their heads that they keep, together and with the files that they share."""
+    return frozenset(axiom for name in names for file in paths(name) for axiom in _said(file, _KEEPS))
+
+
+def _said(file: str, head: re.Pattern[str]) -> list[str]:
+    """The names in all lines of a file that have such a head."""
+    lines = Path(file).read_text(encoding="utf-8").splitlines()
+    return [name for line in lines if (match := head.match(line)) for name in match["names"].split()]

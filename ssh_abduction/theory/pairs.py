@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
 
-Earlier: TypeAlias = Mapping[int, frozenset[int]]  # of a step, the earlier steps that it makes a pair with
+Earlier: TypeAlias = Mapping[int, frozenset[int]]  # for a step, the earlier steps with which it makes a pair
 
 
 @dataclass(frozen=True)
 class Pairs:
     """What is known of pairs of steps before any map is sought. Each mapping leads from a step to earlier steps.
 
-    apart      they are not one dstate; these include all that are elsewhere
+    apart      they are not one dstate; these include all pairs that are not at one place
     elsewhere  they are not at one place
     one        they are one dstate
     """
@@ -25,7 +25,7 @@ class Pairs:
 
     @staticmethod
     def of(apart: Iterable[tuple[int, int]] = (), elsewhere: Iterable[tuple[int, int]] = (), one: Iterable[tuple[int, int]] = ()) -> Pairs:
-        """The same from pairs in any order."""
+        """Pairs whose steps may come in any order."""
         away = list(elsewhere)
         return Pairs(_earlier([*apart, *away]), _earlier(away), _earlier(one))
 
@@ -45,7 +45,7 @@ class Pairs:
         return frozenset((*self.apart, *self.one))
 
     def allow(self, step: int, labels: Sequence[int], place_of: Sequence[int | None] | None = None) -> bool:
-        """Whether a step may be at the dstate that `labels` gives it, as far as it makes pairs with earlier steps.
+        """Whether a step may be at the dstate that `labels` gives it, by what is known of this step and earlier ones.
 
         place_of  the place of each dstate, where that is known
         """
@@ -61,7 +61,7 @@ class Pairs:
         return all(place_of[labels[other]] != place_of[here] for other in self.elsewhere.get(step, ()))
 
     def broken_by(self, labels: Sequence[int]) -> list[tuple[int, int]]:
-        """The pairs of these first steps that labels make one dstate, or do not, against what is known."""
+        """The pairs of these first steps whose labels contradict what is known: the same label where they are apart, or different ones where they are one."""
         size = len(labels)
         wrong = [(i, t) for i, t in pairs_in(self.apart) if t < size and labels[i] == labels[t]]
         return wrong + [(i, t) for i, t in pairs_in(self.one) if t < size and labels[i] != labels[t]]
@@ -73,6 +73,7 @@ def pairs_in(earlier: Earlier) -> list[tuple[int, int]]:
 
 
 def _earlier(pairs: Iterable[tuple[int, int]]) -> dict[int, frozenset[int]]:
+    """For the later step of each pair, the earlier ones."""
     found: dict[int, set[int]] = {}
     for i, j in pairs:
         found.setdefault(max(i, j), set()).add(min(i, j))

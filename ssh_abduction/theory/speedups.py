@@ -25,7 +25,7 @@ from ssh_abduction.theory.theory import Theory
 
 @dataclass(frozen=True, slots=True)
 class Speedups:
-    """Which speed-ups are on. None changes the answer; `TABLE` says what each is, and for which theories it is left on."""
+    """Which speed-ups are on. No speed-up changes an answer. `TABLE` says what each one does, and for which theories it holds."""
 
     prefixes: bool = True
     path_names: bool = True
@@ -53,7 +53,7 @@ class Speedups:
 
     @classmethod
     def without(cls, names: str | Iterable[str]) -> Speedups:
-        """All but these. Raises SolverError."""
+        """All speed-ups but these. Raises SolverError."""
         off = [name for name in (names.split(",") if isinstance(names, str) else names) if name]
         for name in off:
             if name not in SPEEDUPS:
@@ -61,7 +61,7 @@ class Speedups:
         return cls(**dict.fromkeys(off, False))
 
     def that_hold_for(self, theory: Theory) -> Speedups:
-        """Those of these that the table leaves on for a theory whose star is settled."""
+        """Those of these speed-ups that hold for a theory, whose star is settled, by the table."""
         valid = {speedup.switch for speedup in TABLE if speedup.holds_for(theory)}
         return replace(self, **{name: False for name in SPEEDUPS if name not in valid})
 
@@ -73,12 +73,13 @@ SPEEDUPS = tuple(f.name for f in fields(Speedups))
 class Speedup:
     """One row of the table.
 
-    name      what it is called; rows that one switch turns on or off differ in this
-    switch    the field of `Speedups`
+    name      what it is called; several rows may have one switch, but each has its own name
+    switch    the field of `Speedups` that turns it on or off
     sentence  what it does
-    suits     the theories that it is made for
-    rests_on  axioms that it needs, as far as there is something that they speak of: none of them may be left out or be excused
-    keeps     axioms whose maps it does not lose or add to; EVERY where whatever is added only takes maps away, or is asked of each map
+    suits     whether it is made for a theory
+    rests_on  axioms that it needs: none of them may be left out or be excused, unless the theory has nothing that they speak of
+    keeps     the axioms for which it is exact: it neither loses maps that satisfy them, nor lets maps pass that do not. EVERY, where each further axiom
+              only takes maps away, or every map is checked anyway
     """
 
     name: str
@@ -122,7 +123,7 @@ def _has_bare_places(theory: Theory) -> bool:
 
 
 def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozenset[str]]:
-    """What the heads of fast encodings say, read when it is first asked for; and what Python adds to these."""
+    """What the heads of these fast encodings say that they keep, read when it is first asked for, and what Python code keeps beside them."""
     return lambda: encodings.keeps(*names) | frozenset(and_also)
 
 
@@ -155,7 +156,7 @@ FRAMES = PLACES | {
     "path_goes_straight",
 }
 NOTHING: frozenset[str] = frozenset()
-# The axioms that a map of a trace, cut down to some first steps, still satisfies, and that speak of links, observations and pairs of steps alone.
+# The axioms that a map of a trace still satisfies when it is cut to some first steps, and that speak of nothing but links, observations and pairs of steps.
 SURVIVE_A_CUT = FRAMES | {
     "next_place",
     "all_on_paths",
@@ -201,7 +202,7 @@ TABLE = (
         "Places with frames: settle dstates, as visits that are one, before places and paths.",
         _has_frames,
         FRAMES,
-        _kept_by("same", "sides", "streets", and_also=["asserted"]),
+        _kept_by("visits", "sides_framed", "paths_framed", and_also=["asserted"]),
     ),
     Speedup(
         "ways",
@@ -209,7 +210,7 @@ TABLE = (
         "Places without stars: where clingo takes its time, settle dstates before places and paths, with names.",
         _has_bare_places,
         PLACES,
-        _kept_by("names", "ways", "courses", and_also=["asserted"]),
+        _kept_by("names", "sides_frameless", "paths_frameless", and_also=["asserted"]),
     ),
     Speedup(
         "clique",

@@ -30,8 +30,10 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "star": ("auto", "none", "pattern", "frame"),
 }
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
-MOST_STEPS = 2**31  # a trace has fewer, and clingo counts no further
+# Every trace has fewer steps than this: clingo's numbers have 32 bits, so a pair with a greater step could not even be written as a fact.
+MOST_STEPS = 2**31
 ASSERTIONS = ("same", "different", "elsewhere")
+# The fields that some axiom reads, or that `prefer` stands for. Any other field, such as one that somebody adds, is demanded of speed-ups under its own name.
 SPOKEN_FOR = {
     "level",
     *CHOICES,
@@ -42,27 +44,27 @@ SPOKEN_FOR = {
     "without",
     "rules",
     *ASSERTIONS,
-}  # by axioms, or by `prefer`
+}
 CAUSAL = "Theory.causal() (--theory causal)"  # in error messages
 
 
 @dataclass(frozen=True)
 class Theory:
-    """A choice of axioms and of a preference. Frozen; made by a preset and `replace`, or field by field.
+    """A choice of axioms and of what is preferred. It is frozen, and made by a preset and `replace`, or field by field.
 
     level            causal (dstates only) or topological (dstates, places, paths)
     boundary         the axioms of right and left of a path: none, strict, or defeasible (pairs of paths may be excused)
-    symmetric_sides  a turn says four side relations rather than one
+    symmetric_sides  paths cross, so that a turn tells four relations of sides rather than one
     path_order       whether the order of the places of a path is partial or total
     next_place       a travel leads to the next place of its path
-    all_on_paths     every dstate is along a path, also the ones never travelled from or to
+    all_on_paths     every dstate is along a path, even one that no travel starts or ends at
     star             the openings seen at a place: none, pattern (agree up to rotation), frame (agree when turned by the
                      heading, and paths go straight on); auto is frame where the trace has stars, and none elsewhere
-    prefer           what is minimised, first to last, of dstates, paths, places, and, with boundary=defeasible, excuses, which go
-                     first unless named; what is not named is not minimised
+    prefer           what is minimised, first to last: dstates, paths, places, and with boundary=defeasible excuses, which go first
+                     unless they are named; what is not named is not minimised
     without          names of axioms left out, to see what they do
     rules            a user's own rules: paths of files over the predicates of the encodings, or Rules
-    same, different, elsewhere  pairs of steps that are one dstate; that are not; and that are not even at one place: what a person knows
+    same, different, elsewhere  what a person knows of pairs of steps: that they are one dstate, that they are not, or that they are not even at one place
 
     The axioms and their sources are in docs/theory.md; `ssh-abduction theory` prints them.
     """
@@ -138,7 +140,7 @@ class Theory:
 
     @classmethod
     def circumscriptive(cls) -> Theory:
-        """The same axioms, fewest paths, then places: the preference of Remolina & Kuipers (2004), then fewest dstates."""
+        """All levels, fewest paths first, then places, as Remolina & Kuipers (2004) prefer, and then dstates."""
         return cls(prefer=("paths", "places", "dstates"))
 
     def replace(self, **choices: Any) -> Theory:
@@ -168,12 +170,14 @@ class Theory:
 
     @cached_property
     def given_up(self) -> frozenset[str]:
-        """The axioms that do not hold of something that the theory speaks of: they are not chosen, left out, or may be broken."""
+        """The axioms that are about something that the theory speaks of, but need not hold: they are not chosen, are left out, or may be excused."""
         return frozenset(a.name for a in encodings.axioms() if a.has_subject_in(vars(self))) - self.hard
 
     @cached_property
     def demands(self) -> frozenset[str]:
-        """All that a speed-up has to keep: the axioms, with what may be excused by a name of its own; and what no axiom speaks for."""
+        """All that a speed-up has to keep: the hard axioms, and under names of their own an axiom that may be excused, assertions that steps are one, the
+        user's own rules, and fields that no axiom speaks for.
+        """
         excusable = {f"{name}, excusable" for name in set(self.axioms) - self.hard}
         asserted = {"asserted same"} if self.same else set()
         rules = {f"the rules of {rules.name}" for rules in self.rules}
@@ -182,14 +186,14 @@ class Theory:
 
     @cached_property
     def asserted(self) -> Pairs:
-        """What somebody says of pairs of steps, once for each theory, as there may be many."""
+        """What somebody asserts of pairs of steps. It is computed once for a theory, as there may be many pairs."""
         return Pairs.of(self.different, self.elsewhere, self.same)
 
     def with_frames(self) -> Theory | None:
-        """A theory in which places have frames and fewest dstates come first, and whose maps, but for their headings, are maps of this one.
+        """A theory in which places have frames and fewest dstates come first. Its maps, without their headings, are maps of this theory, too.
 
-        None for the causal level. The trace need have no stars. Its maps have all axioms of this theory: their paths are totally
-        ordered, their boundaries, if there are any, strict, so that no pair of paths is excused, and stars that agree in a frame are one pattern.
+        None for the causal level. The trace need not have stars. The maps satisfy all axioms of this theory: their paths are totally
+        ordered; the axioms of sides, if there are any, hold without excuses; and stars that agree in a frame are one pattern.
         """
         if self.level == "causal":
             return None
@@ -261,11 +265,11 @@ class Theory:
 
 
 class _Checked(tuple[Pair, ...]):
-    """Pairs that were checked before: there may be many, and a theory is often made of another one."""
+    """Pairs that were checked already. There may be many, and theories are often made from another one, which need not check them again."""
 
 
 def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
-    """Pairs of steps, each in order, once: from pairs, or from text such as 3,12. Raises TheoryError."""
+    """Pairs of steps, the earlier step first and each pair once, from pairs or from text such as 3,12. Raises TheoryError."""
     if isinstance(value, _Checked):
         return value
     mend = f"write {field}=[(3, 12)] (--{field} 3,12)"
