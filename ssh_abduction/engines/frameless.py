@@ -88,6 +88,7 @@ class WaysEngine(NamedEngine):
         self._ways: set[int] = set()  # dstates of whose paths clingo was told
         self._asked: tuple[_Question, clingo.Control] | None = None  # the last labels, and the control for their places and paths
         self._best: tuple[tuple[int, ...], list[list[int]]] | None = None  # the minimal cost, and all labels that have it
+        self._seeks_fewest = False  # whether the fewest dstates are being sought, rather than all labels with so many listed
 
     def grow(self, size: int) -> None:
         if size == self.size:
@@ -104,10 +105,17 @@ class WaysEngine(NamedEngine):
         return {view: max(count, found[view] - pinned[view] + 1) for view, count in super()._first_spares().items()}
 
     def _settled(self) -> bool:
-        """Never. Raises Settled where the known map has as few dstates as the bound."""
-        if self._known and (self.bound or 0) >= len(set(self._known)):
+        """Never. Raises Settled where the fewest dstates are sought, and the known map has as few as the bound."""
+        if self._seeks_fewest and self._known and (self.bound or 0) >= len(set(self._known)):
             raise Settled
         return False
+
+    def _better_labels(self) -> Iterator[list[int]]:
+        self._seeks_fewest = True
+        try:
+            yield from super()._better_labels()
+        finally:
+            self._seeks_fewest = False
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         *_, fewest = self._better_labels()
