@@ -114,6 +114,17 @@ def test_limits_hold_on_traces_with_flaws(case: Case, tmp_path: Path) -> None:
 
 
 @POSIX
+def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(noisy: Path, tmp_path: Path) -> None:
+    rules = tmp_path / "own.lp"
+    rules.write_text("n(1..400). large(X,Y,Z) :- n(X), n(Y), n(Z).\n#program step(t).\n:- same(I,t), large(I,I,I).")  # 64 million atoms
+    command = [sys.executable, "-m", "ssh_abduction", "solve", str(noisy), f"--rules={rules}", "--time-limit=1", "--json"]
+    began = time.monotonic()
+    done = subprocess.run(command, capture_output=True, timeout=30, check=False)
+    assert time.monotonic() - began < SLACK * (1.2 * 1 + 1)
+    assert (done.returncode, json.loads(done.stdout)["stopped"]) == (30, "time limit")
+
+
+@POSIX
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize("many", [False, True], ids=["one trace", "two at a time"])
 def test_who_is_interrupted_prints_what_is_known(number: int, code: int, many: bool, noisy: Path) -> None:
