@@ -106,8 +106,9 @@ def solve(
     Ctrl-C ends the search like a limit does. Raises TraceError or TheoryError where the trace lacks what the theory needs.
     Source: Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
-    if choices:
-        theory = _checked(theory).replace(**choices)
+    theory = _checked(theory).replace(**choices)
+    if isinstance(trace, Trace):
+        theory.check_steps(trace)
     search = Search(trace, theory, limit=limit, maps=maps, memory=memory, speedups=speedups, on_progress=on_progress)
     return search.solution(tuple(search))
 
