@@ -18,8 +18,8 @@ import clingo
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.rules import check_rules
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
+from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.trace import Trace, checked_trace
 
 POLL = 0.05  # seconds between two questions whether to stop
 
@@ -63,7 +63,7 @@ def explain(trace: Trace, theory: Theory | None = None, stop: Callable[[], bool]
     The stretch is found by dropping steps from the end and from the start, the clashes by dropping axioms one by one. `stop` is asked
     now and then; when it says yes, Interrupted is raised.
     """
-    theory = (theory or Theory.topological()).resolve(trace)
+    theory = checked_theory(theory).resolve(checked_trace(trace))
     theory.check_steps(trace)
     check_rules(theory)
     whole = len(trace)

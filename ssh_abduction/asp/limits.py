@@ -9,11 +9,19 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Literal, TypeAlias
 
+from ssh_abduction.errors import SolverError, brief, is_finite
+
 RESERVE = 0.2  # share of the time limit kept for finding any map of the whole trace
 POLL = 0.05  # seconds between looks at the clock and for Ctrl-C
 TICK = 0.5  # seconds between reports of progress while clingo is busy
 
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
+
+
+def check_limit(name: str, unit: str, limit: object) -> None:
+    """Raises SolverError where a limit that a caller gives is neither None nor a number above 0."""
+    if limit is not None and not (is_finite(limit) and limit > 0) and not (isinstance(limit, float) and limit == math.inf):
+        raise SolverError(f"{name}: expected a number of {unit} above 0, got {brief(limit)}; leave it out for none")
 
 
 class Stopped(Exception):  # noqa: N818 - not an error

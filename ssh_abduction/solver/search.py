@@ -51,11 +51,11 @@ from typing import Any
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Grounding
-from ssh_abduction.asp.limits import Paused, Stop, Stopped, Watch
+from ssh_abduction.asp.limits import Paused, Stop, Stopped, Watch, check_limit
 from ssh_abduction.asp.rules import check_rules
 from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Found
 from ssh_abduction.engines.stepwise import StepEngine
-from ssh_abduction.errors import SolverError, TheoryError, TraceError, brief
+from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import check, unchecked
 from ssh_abduction.maps import SSHMap
@@ -64,9 +64,9 @@ from ssh_abduction.solver.result import Bound, Progress, Seconds, Solution, Stat
 from ssh_abduction.steps.certificate import Evidence
 from ssh_abduction.steps.log import Log, Outcome, Replay
 from ssh_abduction.theory.evidence import Equality, evidence_of
-from ssh_abduction.theory.speedups import Speedups, row
-from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
+from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
+from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.trace import Trace, checked_trace
 
 FIRST_PREFIX = 8  # steps; short enough that solving it costs next to nothing
 HELD_BACK = 1000  # maps kept until a prefix proves long enough; from there on they stream
@@ -106,18 +106,10 @@ def solve(
     Ctrl-C ends the search like a limit does. Raises TraceError or TheoryError where the trace lacks what the theory needs.
     Source: Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
-    theory = _checked(theory).replace(**choices)
-    if isinstance(trace, Trace):
-        theory.check_steps(trace)
+    theory = checked_theory(theory).replace(**choices)
+    theory.check_steps(checked_trace(trace))
     search = Search(trace, theory, limit=limit, maps=maps, memory=memory, speedups=speedups, on_progress=on_progress)
     return search.solution(tuple(search))
-
-
-def _checked(theory: Theory | None) -> Theory:
-    """The theory that a caller gives, or the default. Raises TheoryError."""
-    if not isinstance(theory, Theory | None):
-        raise TheoryError(f"theory: expected a Theory, got {brief(theory)}; take Theory.topological(), Theory.causal() or Theory(…)")
-    return theory or Theory.topological()
 
 
 class Search:
@@ -142,20 +134,16 @@ class Search:
         after: Search | None = None,
         minimal: SSHMap | None = None,
     ) -> None:
-        if not isinstance(trace, Trace):
-            raise TraceError(f"trace: expected a Trace, got {brief(trace)}; make one with Trace.load or Trace.from_steps")
+        checked_trace(trace)
         if isinstance(maps, bool) or not hasattr(maps, "__index__"):
             raise SolverError(f"maps (--maps): expected a whole number, 0 for all, got {brief(maps)}")
-        for name, value in (("limit (--time-limit)", limit), ("memory (--memory-limit)", memory)):
-            if isinstance(value, bool) or not isinstance(value, int | float | None):
-                raise SolverError(f"{name}: expected a number, got {brief(value)}")
-        if limit is not None and not limit > 0:
-            raise SolverError(f"limit (--time-limit): expected a number of seconds above 0, got {brief(limit)}; leave it out for none")
         if maps < 0:
             raise SolverError(f"maps (--maps): expected 0 (all) or more, got {maps}")
-        if memory is not None and memory <= 0:
-            raise SolverError(f"memory (--memory-limit): expected a number of MiB above 0, got {brief(memory)}; leave it out for none")
-        self.theory = _checked(theory).resolve(trace)
+        check_limit("limit (--time-limit)", "seconds", limit)
+        check_limit("memory (--memory-limit)", "MiB", memory)
+        if on_progress is not None and not callable(on_progress):
+            raise SolverError(f"on_progress: expected a function of one Progress, got {brief(on_progress)}")
+        self.theory = checked_theory(theory).resolve(trace)
         check_rules(self.theory)
         self.trace = trace
         self.status = Status.UNKNOWN
@@ -171,7 +159,7 @@ class Search:
         self._most = maps
         self._goes_on = after is not None
         self._log = Log(trace, self.theory)
-        self._asked_speedups = speedups
+        self._asked_speedups = checked_speedups(speedups)
         self._speedups = speedups.that_hold_for(self.theory)
         self._whole = not self._speedups.prefixes
         self._refusing = evidence_of(self.theory)

@@ -54,6 +54,8 @@ class Speedups:
     @classmethod
     def without(cls, names: str | Iterable[str]) -> Speedups:
         """All but these. Raises SolverError."""
+        if not isinstance(names, Iterable):
+            raise SolverError(f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(names)}")
         off = [name for name in (names.split(",") if isinstance(names, str) else names) if name]
         for name in off:
             if name not in SPEEDUPS:
@@ -64,6 +66,13 @@ class Speedups:
         """Those of these that the table leaves on for a theory whose star is settled."""
         valid = {speedup.switch for speedup in TABLE if speedup.holds_for(theory)}
         return replace(self, **{name: False for name in SPEEDUPS if name not in valid})
+
+
+def checked_speedups(value: object) -> Speedups:
+    """The speed-ups that a caller gives. Raises SolverError."""
+    if not isinstance(value, Speedups):
+        raise SolverError(f"speedups: expected Speedups, got {brief(value)}; take Speedups() or Speedups.without(…)")
+    return value
 
 
 SPEEDUPS = tuple(f.name for f in fields(Speedups))
