@@ -237,6 +237,11 @@ VIEWS = [number % 4 for number in range(201)]
 ACTIONS = [number % 2 for number in range(200)]
 
 
+# Circuits of corridors, in which one view is seen in several places, and other things are done there.
+CORRIDORS = [0, 1, 2, 1, 0, 2, 0, 1, 1, 3] * 20
+DONE = ([0, 1, 0, 0, 1, 1, 0, 1, 0, 1] * 20)[:-1]
+
+
 def with_view(step: int) -> tuple[list[int], list[int]]:
     """Circuits of which one view is wrong."""
     return [*VIEWS[:step], (VIEWS[step] + 1) % 4, *VIEWS[step + 1 :]], ACTIONS
@@ -246,6 +251,8 @@ def with_view(step: int) -> tuple[list[int], list[int]]:
     ("views", "actions", "step"),
     [
         (VIEWS, ACTIONS, None),
+        (CORRIDORS, DONE, None),
+        ([*CORRIDORS[:120], 9, *CORRIDORS[121:]], DONE, 120),
         (*with_view(200), 200),
         (*with_view(120), 120),
         (*with_view(30), 30),
