@@ -16,7 +16,7 @@ import pytest
 from limits import Case, cases, outcome
 from worlds import rectangle
 
-from ssh_abduction import Theory, Trace, solve
+from ssh_abduction import Search, Status, Theory, Trace, solve
 from ssh_abduction.asp.control import Control
 from ssh_abduction.asp.limits import Stopped, Watch, peak_memory
 from ssh_abduction.cli import workers
@@ -279,6 +279,18 @@ def test_a_warning_names_the_step(noisy: Path) -> None:
         f"looks like noise at step {last}: because of it {last} of the {last + 1} steps up to there have to be dstates of their own"
         in warning
     )
+
+
+def test_noise_is_told_where_the_search_is_stopped_after_a_minimal_map_is_known() -> None:
+    trace = rectangle(80)
+    flawed = replace(trace, steps=trace.steps[:40] + trace.steps[41:])
+    search = Search(flawed, Theory.causal())
+    list(search)
+    assert search.status is Status.OPTIMAL
+    search._engine.size, search.stopped = 0, "time limit"  # as where the limit ends the listing while clingo is given more
+    noise = search.solution().noise
+    assert noise
+    assert noise.step == 40
 
 
 def test_a_certificate_without_words_is_checked_along_the_trace(monkeypatch: pytest.MonkeyPatch) -> None:

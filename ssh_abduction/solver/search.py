@@ -285,6 +285,11 @@ class Search:
 
     def solution(self, maps: tuple[SSHMap, ...] = ()) -> Solution:
         """How the search ended, with the maps that the caller kept."""
+        ran_out = self.stopped not in (
+            None,
+            "maps limit",
+        )  # perhaps while the prefix was given to clingo: then what shows the bound is sought in all steps
+        evidence = self._apart or self._evidence(len(self.trace) if ran_out else self.prefix)
         return Solution(
             status=self.status,
             maps=maps,
@@ -294,7 +299,7 @@ class Search:
             theory=self.theory,
             steps=len(self.trace),
             prefix=self.prefix,
-            evidence=self._evidence(self.prefix) if self._apart is None else self._apart,
+            evidence=evidence,
             seconds=Seconds(self._watch.elapsed(), self._engine.ground_seconds, self._engine.solve_seconds),
             stopped=self.stopped,
             partial=None if self.best else self.partial,
