@@ -26,9 +26,9 @@ CAUSAL += ["maze 2x2 n=1600", "maze 3x3 n=1600", "maze 4x4 n=1600"]
 FULL = ["full rectangle n=400", "full aces3", BARE.name]
 FRAMED = ["full taylor-hall", SMALL.name, "full maze 5x5 n=1600", "full maze 10x10 n=200"]
 USED = {
-    "causal": {"prefixes", "names", "clique", "apart", "lazy", "core_guided", "annealed", "watched", "one_by_one", "threads", "greedy"},
-    "full": {"prefixes", "path_names", "from_below", "framing", "ways"},
-    "framed": {"prefixes", "names", "clique", "lazy", "core_guided", "small_cores", "sides", "annealed", "watched", "threads", "processes"},
+    "causal": {"prefixes", "names", "clique", "lazy", "core_guided", "annealed", "threads", "greedy"},
+    "full": {"prefixes", "path_names", "framing", "ways"},
+    "framed": {"prefixes", "names", "clique", "lazy", "core_guided", "sides", "annealed", "threads", "processes"},
 }
 
 

@@ -58,14 +58,14 @@ def main() -> None:
     sys.exit("\n".join(contradictions(results)) or None)
 
 
-def run(tool: str, instance: Instance, seed: int, limit: float, memory: int) -> dict[str, Any]:
-    """What comes of a tool on a trace: status, wall seconds, CPU seconds, peak MiB, states, and whether they are proven to be fewest."""
+def run(tool: str, instance: Instance, seed: int, limit: float, memory: int, clock: str = "wall") -> dict[str, Any]:
+    """What comes of a tool on a trace: status, seconds by this clock, CPU seconds, peak MiB, states, and whether they are proven to be fewest."""
     cell = {"instance": instance.name, "theory": "causal" if instance.causal else "full", "tool": tool, "seed": seed}
     if tool in PEERS and not instance.causal:
         return {**cell, "status": "not applicable", "reason": "it knows no places and paths"}
     if tool in PEERS and not PEERS[tool].installed:
         return {**cell, "status": "not installed", "reason": f"{PEERS[tool].packages[0]} is not installed"}
-    command = [sys.executable, str(FOLDER / "cell.py"), tool, instance.name, str(seed), str(limit), str(memory)]
+    command = [sys.executable, str(FOLDER / "cell.py"), tool, instance.name, str(seed), str(limit), str(memory), clock]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         assert process.stdout
         said = [json.loads(line) for line in process.stdout]
@@ -77,7 +77,7 @@ def run(tool: str, instance: Instance, seed: int, limit: float, memory: int) -> 
         return {**cell, **said[1]}
     peak = usage.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
     spent = {"seconds": limit, "cpu": round(usage.ru_utime + usage.ru_stime - start.get("cpu", 0), 5), "memory": peak}
-    if process.returncode == -signal.SIGALRM and start:
+    if process.returncode in (-signal.SIGALRM, -signal.SIGPROF) and start:
         return {**cell, "status": "timeout", "reason": "", **spent}
     return {**cell, "status": "error", "reason": f"ended with code {process.returncode}"}
 

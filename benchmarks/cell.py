@@ -1,8 +1,10 @@
 """One tool on one trace, in a process of its own. It prints a line when the clock starts, and a line with what came of it.
 
-    python benchmarks/cell.py TOOL INSTANCE SEED SECONDS MIB
+    python benchmarks/cell.py TOOL INSTANCE SEED SECONDS MIB [CLOCK]
 
-TOOL is a peer, ssh-abduction, or "ssh-abduction without" and the names of speed-ups, commas between.
+TOOL is a peer, ssh-abduction, or "ssh-abduction without" and the names of speed-ups, commas between. `following` is not one that a user can
+switch off: here the guesses at the beginning of a long causal trace, which are followed along the rest, are left out. CLOCK is wall, or cpu: then
+seconds are those that the processors worked for this process, and limits are of these.
 
 The process is ended by a signal when its time is over. The clock does not run while programs are loaded, the trace is made, or the
 answer is checked: a map by the checker, a peer's machine by running it along the trace.
@@ -19,6 +21,7 @@ import signal
 import sys
 import time
 from dataclasses import asdict
+from types import SimpleNamespace
 from typing import Any
 
 import numpy  # noqa: F401 - the search loads it when it first needs it: rather before the clock starts
@@ -27,6 +30,7 @@ from suite import INSTANCES
 from table import OURS, WITHOUT
 
 from ssh_abduction import Search, Solution, Speedups, Theory, Trace
+from ssh_abduction.asp import limits
 from ssh_abduction.asp.limits import peak_memory
 from ssh_abduction.judge.checker import check
 from ssh_abduction.solver.result import Status
@@ -37,7 +41,11 @@ SHARE = 0.8  # of the memory is its own limit, for the same reason
 
 
 def main() -> None:
-    tool, name, seed, seconds, memory = sys.argv[1:]
+    tool, name, seed, seconds, memory, *clock = sys.argv[1:]
+    now, timer = time.perf_counter, signal.ITIMER_REAL
+    if clock == ["cpu"]:
+        now, timer = cpu_seconds, signal.ITIMER_PROF
+        vars(limits)["time"] = SimpleNamespace(perf_counter=cpu_seconds)  # the clock that a search looks at
     instance, limit, space = INSTANCES[name], float(seconds), int(memory)
     end_after(AROUND)
     for module in PEERS[tool].modules if tool in PEERS else ():
@@ -45,27 +53,28 @@ def main() -> None:
     walk = instance.walk(int(seed))
     trace, theory = walk.trace, instance.theory
     resource.setrlimit(resource.RLIMIT_AS, (space * 2**20, -1))
-    say(images=len(trace), true_dstates=len(set(walk.truth)) or None, cpu=time.process_time())
+    say(images=len(trace), true_dstates=len(set(walk.truth)) or None, cpu=cpu_seconds())
 
-    began, cpu = time.perf_counter(), time.process_time()
+    began, cpu = now(), cpu_seconds()
     answer: Any = None
     outcome: dict[str, Any] = {}
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             if tool.startswith(OURS):
-                end_after(limit * (1 + MARGIN) + 1)
-                speedups = Speedups.without(tool.removeprefix(OURS).removeprefix(WITHOUT))
+                end_after(limit * (1 + MARGIN) + 1, timer)
+                speedups = all_but(tool.removeprefix(OURS).removeprefix(WITHOUT))
                 search = Search(trace, theory, limit=limit, memory=int(SHARE * space), maps=1, speedups=speedups)
                 answer = search.solution(tuple(search))
             else:
-                end_after(limit)
+                end_after(limit, timer)
                 answer = PEERS[tool].find(trace)
     except NotApplicableError as error:
         say(status="not applicable", reason=str(error))
         return
     except Exception as error:  # whatever a program raises is what came of it
         outcome = {"status": "memory" if _of_memory(error) else "error", "reason": f"{type(error).__name__}: {error}"[:200]}
-    spent = {"seconds": time.perf_counter() - began, "cpu": time.process_time() - cpu, "memory": peak_memory()}
+    spent = {"seconds": now() - began, "cpu": cpu_seconds() - cpu, "memory": peak_memory()}
+    end_after(0, timer)
     end_after(AROUND)
     if not outcome:
         outcome = (
@@ -103,9 +112,24 @@ def of_machine(machine: Machine, trace: Trace, proven: bool) -> dict[str, Any]:
     return {"status": "ok", "reason": "", "dstates": states, "proven": proven}
 
 
-def end_after(seconds: float) -> None:
-    """From now on the process has so long; then the system ends it, whatever it is doing."""
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+def all_but(names: str) -> Speedups:
+    """All speed-ups but these."""
+    off = names.split(",")
+    if "following" in off:
+        off.remove("following")
+        naming = importlib.import_module("ssh_abduction.engines.naming")
+        naming.NamedLabels._from_beginning = lambda *_: iter(())
+    return Speedups.without(off)
+
+
+def cpu_seconds() -> float:
+    """What the processors worked for this process, all its threads, and the processes that it waited for."""
+    return sum(used.ru_utime + used.ru_stime for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
+
+
+def end_after(seconds: float, timer: int = signal.ITIMER_REAL) -> None:
+    """From now on the process has so long, by this timer; then the system ends it, whatever it is doing. 0: no longer."""
+    signal.setitimer(timer, seconds)
 
 
 def say(**record: Any) -> None:

@@ -100,3 +100,13 @@ def rectangle(circuits: int) -> Walk:
     steps = 8 * circuits
     trace = Trace.from_steps([f"v{i % 4}" for i in range(steps + 1)], [("right", "travel")[i % 2] for i in range(steps)])
     return Walk(trace, tuple(i % 8 for i in range(steps + 1)))
+
+
+def circuits(width: int, height: int, *, rounds: int, seed: int, views: int = 4) -> Walk:
+    """So many times round a block: along each side from place to place, and right at the corners. What is seen is drawn evenly for each state."""
+    chance = random.Random(seed)
+    once = [action for side in (width, height, width, height) for action in ["travel"] * side + ["right"]]
+    shown = [f"v{chance.randrange(views)}" for _ in once]
+    steps = rounds * len(once)
+    trace = Trace.from_steps([shown[i % len(once)] for i in range(steps + 1)], [once[i % len(once)] for i in range(steps)])
+    return Walk(trace, tuple(i % len(once) for i in range(steps + 1)))

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
-from instances import Walk, maze, moore, rectangle
+from instances import Walk, circuits, maze, moore, rectangle
 
 from ssh_abduction import Theory, Trace
 
@@ -18,11 +19,12 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 @dataclass(frozen=True)
 class Instance:
-    """A trace to solve: `walk` makes it from a seed, which `seeded` says matters."""
+    """A trace to solve: `walk` makes it from a seed, which `seeded` says matters. `star` is that of a topological theory."""
 
     name: str
     walk: Callable[[int], Walk]
     seeded: bool = True
+    star: str = "auto"
 
     @property
     def causal(self) -> bool:
@@ -30,7 +32,7 @@ class Instance:
 
     @property
     def theory(self) -> Theory:
-        return Theory.causal() if self.causal else Theory.topological()
+        return Theory.causal() if self.causal else Theory.topological().replace(star=self.star)
 
 
 def aces3() -> Walk:
@@ -58,8 +60,8 @@ def _taylor_hall(seed: int) -> Walk:
     return Walk(steps, tuple(step.truth["dstate"] for step in trace if step.truth))
 
 
-def _circuits(circuits: int) -> Callable[[int], Walk]:
-    return lambda _: rectangle(circuits)
+def _circuits(rounds: int) -> Callable[[int], Walk]:
+    return lambda _: rectangle(rounds)
 
 
 def _moore(states: int, views: int, steps: int) -> Instance:
@@ -94,4 +96,38 @@ SUITE = {
 SMALL = _maze(2, 60, full=True)  # what the full theory's plain encoding can still do: for ablation.py
 # Where a map with frames is sought:
 BARE = Instance("full maze 3x3 n=400, loops, no stars", lambda seed: maze(3, 3, steps=400, seed=seed, loops=0.5))
-INSTANCES = {**SUITE, SMALL.name: SMALL, BARE.name: BARE}
+
+
+def _block(width: int, height: int, rounds: int, *, views: int, full: bool = False) -> Instance:
+    name = f"{'full ' if full else ''}circuits {width}x{height}, {rounds} rounds"
+    return Instance(name, lambda seed: circuits(width, height, rounds=rounds, seed=seed, views=views))
+
+
+def _drive(name: str, side: int, steps: int, star: str = "auto", **kind: Any) -> Instance:
+    return Instance(name, lambda seed: maze(side, side, steps=steps, seed=seed, **kind), star=star)
+
+
+# One speed-up less at a time, over several seeds: for pruning.py.
+PRUNED = (
+    _moore(16, 2, 1600),
+    _moore(16, 2, 10_000),
+    _maze(4, 10_000),
+    _maze(6, 10_000),
+    _maze(8, 10_000),
+    _maze(6, 1600),
+    _drive("maze 5x5 n=1600, corridors followed", 5, 1600, follow=True),
+    _drive("maze 5x5 n=10000, corridors followed", 5, 10_000, follow=True),
+    _drive("maze 7x7 n=10000, corridors followed", 7, 10_000, follow=True),
+    _block(60, 40, 4, views=2),
+    _block(5, 3, 50, views=4, full=True),
+    _block(6, 4, 20, views=4, full=True),
+    _maze(4, 800, full=True),
+    _maze(8, 150, full=True),
+    _maze(10, 400, full=True),
+    _drive("full maze 5x5 n=600, corridors followed", 5, 600, stars=True, follow=True),
+    _drive("full maze 4x4 n=40, corridors followed, no stars", 4, 40, follow=True),
+    _drive("full maze 3x3 n=60, stars as patterns", 3, 60, "pattern", stars=True),
+    _drive("full maze 4x4 n=800, no stars", 4, 800),
+    _drive("full maze 5x5 n=1600, no stars", 5, 1600),
+)
+INSTANCES = {**SUITE, **{instance.name: instance for instance in (SMALL, BARE, *PRUNED)}}

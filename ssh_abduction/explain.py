@@ -18,8 +18,8 @@ import clingo
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.rules import check_rules
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
+from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.trace import Trace, checked_trace
 
 # Seconds between two questions whether to stop, while clingo is busy: as in asp/limits.py.
 POLL = 0.05
@@ -65,7 +65,7 @@ def explain(trace: Trace, theory: Theory | None = None, stop: Callable[[], bool]
 
     stop  asked now and then; when it returns True, Interrupted is raised
     """
-    theory = (theory or Theory.topological()).resolve(trace)
+    theory = checked_theory(theory).resolve(checked_trace(trace))
     theory.check_steps(trace)
     check_rules(theory)
     whole = len(trace)

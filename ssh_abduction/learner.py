@@ -23,8 +23,8 @@ from perception.views import ViewClusterer
 from ssh_abduction.errors import SSHError
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.search import solve
-from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
+from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.trace import Trace, checked_trace
 
 
 class LearnerError(SSHError):
@@ -57,10 +57,11 @@ class BootstrapLearner:
 
     def fit(self, trace: Trace) -> BootstrapLearner:
         """Run the loop. Raises LearnerError, PerceptionError, TraceError."""
-        images = images_of(trace)
+        theory = checked_theory(self.theory)
+        images = images_of(checked_trace(trace))
         self.clusterer_ = self.clusterer or ViewClusterer(random_state=0)
         self.views_ = self.clusterer_.fit(ReciprocalTransformer().fit_transform(images)).labels_
-        self.solution_ = solve(trace.with_views(self.views_.tolist()), self.theory, limit=self.limit)
+        self.solution_ = solve(trace.with_views(self.views_.tolist()), theory, limit=self.limit)
         self.labels_ = labels_of(self.solution_.maps, self.choose, self.solution_.complete)
         self.map_ = self.solution_.maps[self.choose or 0]
         sure = self.labels_ >= 0

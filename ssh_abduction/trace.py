@@ -292,6 +292,13 @@ class Trace:
             yield _dump(step.to_json())
 
 
+def checked_trace(value: object) -> Trace:
+    """The trace that a caller gives. Raises TraceError."""
+    if not isinstance(value, Trace):
+        raise TraceError(f"trace: expected a Trace, got {brief(value)}; make one with Trace.load or Trace.from_steps")
+    return value
+
+
 def _dump(value: Mapping[str, Any]) -> str:
     try:
         return json_line(value)

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import random
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import bench
 import conformance
 import plot
+import pruning
 import pytest
 import readme
 import table
 from instances import moore
 from peers import PEERS, Machine, Words
-from suite import SUITE
+from suite import INSTANCES, SUITE
 
 from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.theory.speedups import SPEEDUPS
+from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
 ROOT = Path(__file__).parent.parent
 STORED = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
@@ -183,6 +188,58 @@ def test_the_table_of_speedups_has_each_of_them() -> None:
     run = json.loads(stored(readme.PAGES["ablation"].read_text(), "ablation").read_text())
     off = {cell["tool"].removeprefix("−") for cell in run["cells"]} - {"ssh-abduction", "all"}
     assert off == set(SPEEDUPS)
+
+
+@pytest.mark.parametrize(
+    ("measure", "base", "without", "ratio"),
+    [
+        ("seconds", {"status": "ok", "seconds": 2}, {"status": "ok", "seconds": 3}, 1.5),
+        ("seconds", {"status": "ok", "seconds": 2}, {"status": "timeout", "seconds": 11}, 5),
+        ("seconds", {"status": "memory", "seconds": 1}, {"status": "ok", "seconds": 5}, 0.5),
+        ("seconds", {"status": "timeout", "seconds": 10}, {"status": "timeout", "seconds": 10}, 1),
+        ("dstates", {"dstates": 20}, {"dstates": 50}, 2.5),
+        ("dstates", {"dstates": 20}, {"dstates": None}, math.inf),
+        ("dstates", {}, {"dstates": None}, 1),
+    ],
+)
+def test_what_a_speedup_gains(measure: str, base: dict[str, Any], without: dict[str, Any], ratio: float) -> None:
+    assert pruning.ratio(measure, 10, base, without) == ratio
+
+
+def test_a_speedup_stays_that_gains_on_two_families() -> None:
+    assert pruning.stays([[1, 1.5, 9], [1, 1, 1], [math.inf, 2, 0]])
+    assert not pruning.stays([[1, 1.4, 9], [1, 1, 1], [math.inf, 2, 0]])
+
+
+def test_each_speedup_is_tried_on_three_families() -> None:
+    for name in SPEEDUPS:
+        assert len({trial.family for trial in pruning.TRIALS if trial.switch == name}) >= 3, name
+    assert {trial.family for trial in pruning.TRIALS} <= set(INSTANCES)
+
+
+def test_seconds_of_the_processor_are_what_a_search_is_limited_by() -> None:
+    late = bench.run("ssh-abduction", SUITE["maze 8x8 n=4000"], 0, 2, 4096, "cpu")
+    assert late["status"] == "timeout"
+    assert late["seconds"] == pytest.approx(late["cpu"], abs=0.1)
+    assert 1.5 < late["seconds"] < 6
+
+
+def test_following_is_no_speedup_of_a_user_and_can_be_left_out() -> None:
+    script = "from cell import all_but; from ssh_abduction.engines.naming import NamedLabels as E; print(all_but('following'), list(E._from_beginning(None)))"
+    said = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=ROOT / "benchmarks",
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert said.stdout == f"{Speedups()} []\n"
+
+
+def test_the_page_of_pruning_shows_its_stored_run() -> None:
+    path = ROOT / "benchmarks" / "results" / "pruning.json"
+    assert (ROOT / "docs" / "pruning.md").read_text() == pruning.page(json.loads(path.read_text()), path)
 
 
 def test_the_picture_of_growth_is_drawn_from_the_run(tmp_path: Path) -> None:

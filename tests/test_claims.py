@@ -94,6 +94,14 @@ LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = 
     "optimal, and no bound": ({"bound": {}}, "bound: expected 19 dstates, the cost of map 1, as the status is optimal, got none"),
     "a bound of another type": ({"bound": {"dstates": "19"}}, "bound: expected numbers of dstates, paths, places, excuses, got"),
     "a bound of something else": ({"bound": {"rooms": 1}}, "bound: expected numbers of dstates, paths, places, excuses, got"),
+    "a bound of what is not minimised first": (
+        {"bound": {"dstates": 19, "paths": 1}},
+        "bound: expected none of paths, as the theory minimises dstates first, got 1",
+    ),
+    "no such reason to stop": (
+        {"complete": False, "stopped": "lunch"},
+        "stopped: expected one of time limit, memory limit, interrupted, maps limit, got 'lunch'",
+    ),
     "no such status": ({"status": "perfect"}, "status: expected one of optimal, feasible, unsatisfiable, unknown, got 'perfect'"),
     "a status of another type": ({"status": [1]}, "status: expected one of optimal, feasible, unsatisfiable, unknown, got [1]"),
     "no map, though there are some": (

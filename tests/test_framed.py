@@ -258,7 +258,7 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
     assert seed != 0 or any(told for _, told in streets)
 
 
-@pytest.mark.parametrize("off", ["", "clique", "core_guided", "small_cores", "sides"])
+@pytest.mark.parametrize("off", ["", "clique", "core_guided", "sides"])
 @pytest.mark.parametrize("seed", range(3))
 def test_each_speedup_off_alone(seed: int, off: str) -> None:
     """On walks long enough for cores, for visits that have to be told to be transitive, and for maps that are found nearby."""

@@ -16,7 +16,7 @@ import pytest
 from limits import Case, cases, outcome
 from worlds import rectangle
 
-from ssh_abduction import Theory, Trace, solve
+from ssh_abduction import Search, Status, Theory, Trace, solve
 from ssh_abduction.asp.control import Control
 from ssh_abduction.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.cli import workers
@@ -111,6 +111,17 @@ def test_limits_hold_on_traces_with_flaws(case: Case, tmp_path: Path) -> None:
     assert found.status in ("optimal", "feasible", "unsatisfiable", "unknown")
     assert found.seconds <= SLACK
     assert found.mebibytes <= 1
+
+
+@POSIX
+def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(noisy: Path, tmp_path: Path) -> None:
+    rules = tmp_path / "own.lp"
+    rules.write_text("n(1..400). large(X,Y,Z) :- n(X), n(Y), n(Z).\n#program step(t).\n:- same(I,t), large(I,I,I).")  # 64 million atoms
+    command = [sys.executable, "-m", "ssh_abduction", "solve", str(noisy), f"--rules={rules}", "--time-limit=1", "--json"]
+    began = time.monotonic()
+    done = subprocess.run(command, capture_output=True, timeout=30, check=False)
+    assert time.monotonic() - began < SLACK * (1.2 * 1 + 1)
+    assert (done.returncode, json.loads(done.stdout)["stopped"]) == (30, "time limit")
 
 
 @POSIX
@@ -226,6 +237,11 @@ VIEWS = [number % 4 for number in range(201)]
 ACTIONS = [number % 2 for number in range(200)]
 
 
+# Circuits of corridors, in which one view is seen in several places, and other things are done there.
+CORRIDORS = [0, 1, 2, 1, 0, 2, 0, 1, 1, 3] * 20
+DONE = ([0, 1, 0, 0, 1, 1, 0, 1, 0, 1] * 20)[:-1]
+
+
 def with_view(step: int) -> tuple[list[int], list[int]]:
     """Circuits of which one view is wrong."""
     return [*VIEWS[:step], (VIEWS[step] + 1) % 4, *VIEWS[step + 1 :]], ACTIONS
@@ -235,6 +251,8 @@ def with_view(step: int) -> tuple[list[int], list[int]]:
     ("views", "actions", "step"),
     [
         (VIEWS, ACTIONS, None),
+        (CORRIDORS, DONE, None),
+        ([*CORRIDORS[:120], 9, *CORRIDORS[121:]], DONE, 120),
         (*with_view(200), 200),
         (*with_view(120), 120),
         (*with_view(30), 30),
@@ -261,6 +279,18 @@ def test_a_warning_names_the_step(noisy: Path) -> None:
         f"looks like noise at step {last}: because of it {last} of the {last + 1} steps up to there have to be dstates of their own"
         in warning
     )
+
+
+def test_noise_is_told_where_the_search_is_stopped_after_a_minimal_map_is_known() -> None:
+    trace = rectangle(80)
+    flawed = replace(trace, steps=trace.steps[:40] + trace.steps[41:])
+    search = Search(flawed, Theory.causal())
+    list(search)
+    assert search.status is Status.OPTIMAL
+    search._engine.size, search.stopped = 0, "time limit"  # as where the limit ends the listing while clingo is given more
+    noise = search.solution().noise
+    assert noise
+    assert noise.step == 40
 
 
 def test_a_certificate_without_words_is_checked_along_the_trace(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,7 +44,7 @@ def agree(trace: Trace, theory: Theory) -> None:
     theory = theory.resolve(trace)
     _, answers = follow(trace, theory)
     for i, answer in enumerate(answers):
-        anew = solve(trace.prefix(i + 1), theory, maps=0)
+        anew = solve(trace.prefix(i + 1), theory.of_steps(0, i + 1), maps=0)
         assert (answer.status, answer.complete, answer.steps) == (anew.status, True, i + 1)
         assert answer.bound == anew.bound or not anew.maps
         assert set(answer.maps) == set(anew.maps)
@@ -72,7 +72,7 @@ def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
     theory = data.draw(theories(trace), label="theory").resolve(trace)
     _, answers = follow(trace, theory, maps=2, speedups=Speedups(prefixes=data.draw(st.booleans(), label="prefixes")))
     for i, answer in enumerate(answers):
-        anew = solve(trace.prefix(i + 1), theory, maps=0)
+        anew = solve(trace.prefix(i + 1), theory.of_steps(0, i + 1), maps=0)
         assert answer.status is anew.status
         assert answer.bound == anew.bound or answer.status is Status.UNSATISFIABLE
         assert answer.count == min(2, anew.count)

@@ -18,6 +18,7 @@ from strategies import TOYS, Toy, traces
 from worlds import ACTIONS
 
 from ssh_abduction import OnlineMapper, Speedups, SSHMap, Status, Theory, TheoryError, Trace, solve
+from ssh_abduction.cli import main
 from ssh_abduction.engines.causal import CausalEngine
 from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.explain import explain
@@ -253,6 +254,18 @@ def test_an_explanation_names_assertions_and_own_axioms() -> None:
         ("#program step(t).\n:- not same_place(5,15).", r"own\.lp:2: not same_place\(5,15\): expected to be asked at a step"),
         ("#minimize { 1,I : same(I,3) }.", r"own\.lp:1: expected rules, got"),
         ("#show same/2.", r"own\.lp:1: expected rules, got #show"),
+        (
+            "#program step(t).\n:- same(@first(1),t).",
+            r"own\.lp:2: expected what clingo works out by itself, got @first\(1\), a function of Python's",
+        ),
+        ("#program step(t).\n:- same(I,t,5).", r"own\.lp:2: same\(I,t,5\): expected 2 arguments, got 3"),
+        (
+            "% @axiom(odd) Mine.\n#program step(t).\nviolation(odd) :- same(0,t).",
+            r"own\.lp:3: violation\(odd\): expected 2 arguments, got 1",
+        ),
+        ('#include "other.lp".\n', r"own\.lp: expected rules, got #include of other\.lp; give that file, too"),
+        ("#external own(1).", r"own\.lp:1: expected rules, got #external"),
+        ("#script (python)\n#end.", r"own\.lp:1: expected rules, got #script"),
         ("% @axiom(deterministic) Mine.\n", r"own\.lp: @axiom\(deterministic\): expected a name that no other axiom has"),
     ],
 )
@@ -261,9 +274,37 @@ def test_rules_that_could_never_be_read_say_how_to_write_them(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("own.lp").write_text(text)
+    Path("other.lp").write_text("limit(3).")
     with pytest.raises(TheoryError, match=message) as error:
         solve(Trace.from_steps("aa", ["travel"]), rules=["own.lp"])
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("text", "where"), [("#program step(t).\n:- same(I,t), X > 3.", "b.lp:2"), ("#const n = 2.", "b.lp:1")])
+def test_of_several_files_of_rules_the_wrong_one_is_named(text: str, where: str) -> None:
+    rules = [Rules("a.lp", "#const n = 1."), Rules("b.lp", text)]
+    for files in (rules, rules[::-1]) if "same" in text else (rules,):
+        with pytest.raises(TheoryError, match=where):
+            solve(Trace.from_steps("aa", ["travel"]), rules=files)
+
+
+@pytest.mark.parametrize("words", ["solve T", "solve T --jobs 1", "check T M"])
+def test_a_step_that_the_trace_does_not_have_is_an_error(words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trace = Trace.from_steps("aa", ["travel"])
+    trace.save(tmp_path / "T")
+    solve(trace).maps[0].save(tmp_path / "M")
+    assert main([*(str(tmp_path / word) if word in "TM" else word for word in words.split()), "--same=0,2"]) == 1
+    captured = capsys.readouterr()
+    assert "same (--same): expected steps from 0 to 1, got 0,2" in captured.out + captured.err
+    with pytest.raises(TheoryError, match="expected steps from 0 to 1, got 0,2"):
+        solve(trace, same=[(0, 2)])
+
+
+def test_a_file_of_rules_without_end_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ssh_abduction.theory.rules.LARGEST", 100)
+    (tmp_path / "own.lp").write_text("% long\n" * 100)
+    with pytest.raises(TheoryError, match="cannot be read: expected at most"):
+        Theory.causal().replace(rules=[tmp_path / "own.lp"])
 
 
 def test_rules_may_read_facts_and_atoms_of_their_own() -> None:

@@ -24,7 +24,20 @@ from strategies import theories, traces
 from worlds import TOURS, drive, rectangle, written
 
 from benchmarks.instances import maze
-from ssh_abduction import Progress, Search, SolverError, Speedups, SSHMap, Status, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction import (
+    OnlineMapper,
+    Progress,
+    Search,
+    SolverError,
+    Speedups,
+    SSHMap,
+    Status,
+    Theory,
+    TheoryError,
+    Trace,
+    TraceError,
+    solve,
+)
 from ssh_abduction.asp.facts import links_of
 from ssh_abduction.engines import base as engine_module
 from ssh_abduction.engines import stepwise
@@ -34,10 +47,13 @@ from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.errors import SSHError
 from ssh_abduction.explain import Interrupted, explain
 from ssh_abduction.judge.checker import check
+from ssh_abduction.learner import BootstrapLearner
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver import search as solver_module
 from ssh_abduction.steps.log import Log, Outcome
 
+TRACE = rectangle(8)
+MAP = solve(TRACE).maps[0]
 THEORIES = {"causal": Theory.causal(), "topological": Theory.topological(), "circumscriptive": Theory.circumscriptive()}
 
 
@@ -113,8 +129,37 @@ def test_streaming_lists_no_map_twice_and_misses_none(seed: int, monkeypatch: py
     ],
 )
 def test_arguments_of_another_kind(arguments: tuple[Any, ...], message: str) -> None:
+    for function in (
+        solve,
+        Search,
+        explain,
+        lambda *rest: check(rest[0], MAP, *rest[1:]),
+        lambda *rest: BootstrapLearner(*rest[1:]).fit(rest[0]),
+    ):
+        with pytest.raises(SSHError, match=re.escape(message)):
+            function(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: OnlineMapper("a", "causal"), "theory: expected a Theory, got 'causal'"),
+        (lambda: OnlineMapper("a", limit="5"), "limit: expected a number of seconds above 0, got '5'"),
+        (lambda: OnlineMapper("a", speedups=None), "speedups: expected Speedups, got None"),
+        (lambda: BootstrapLearner().fit(None), "trace: expected a Trace, got None"),
+        (lambda: check(TRACE, None), "map: expected an SSHMap, got None"),
+        (lambda: solve(TRACE, memory=float("nan")), "memory (--memory-limit): expected a number of MiB above 0, got nan"),
+        (lambda: solve(TRACE, limit=10**400), "limit (--time-limit): expected a number of seconds above 0, got 1000"),
+        (lambda: solve(TRACE, speedups="none"), "speedups: expected Speedups, got 'none'"),
+        (lambda: solve(TRACE, on_progress=3), "on_progress: expected a function of one Progress, got 3"),
+        (lambda: Speedups.without(3), "speedups: expected names out of "),
+        (lambda: Speedups(prefixes="no"), "speedups: prefixes: expected true or false, got 'no'"),
+        (lambda: Trace.from_steps(["a"], [], stars=[{}]), "star"),
+    ],
+)
+def test_arguments_of_another_kind_are_errors_of_the_package(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(SSHError, match=re.escape(message)):
-        solve(*arguments)
+        call()
 
 
 @pytest.mark.parametrize("maps", [None, 1.5, True])

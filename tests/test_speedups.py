@@ -105,38 +105,6 @@ def test_each_speedup_off_alone(off: str, theory: Theory) -> None:
     assert found.cost == expected.cost
 
 
-@pytest.mark.parametrize("off", ["", "clique", "apart"])
-@pytest.mark.parametrize("spares", [0, 2])
-@pytest.mark.parametrize("seed", range(8))
-def test_numbers_of_dstates_asked_for_one_by_one(seed: int, spares: int, off: str) -> None:
-    """From the clique up, or from one dstate, with names so few that answers use the rest: the minimum, and its maps. Every other time with two threads."""
-    trace = moore(6, 2, steps=40, seed=seed).trace
-    grow = named.NamedLabels.grow
-
-    def grow_and_ask(engine: named.NamedLabels, size: int) -> None:
-        """Such short traces are solved before there are enough conflicts."""
-        if size != engine.size:
-            grow(engine, size)
-            engine.add(engine.chart.links)
-            engine._hard = seed % 2 == 0
-            engine._ask_one_by_one()
-
-    every = solve(trace, Theory.causal(), maps=0, speedups=Speedups.without("names"))
-    with (
-        patch.object(named, "SPARES", spares),
-        patch.object(engine, "FIRST_PREFIXES", len(trace)),
-        patch.object(named.NamedLabels, "grow", grow_and_ask),
-    ):
-        found = solve(trace, Theory.causal(), maps=0, limit=30, speedups=Speedups.without(off))
-        some = solve(trace, Theory.causal(), maps=3, limit=30, speedups=Speedups.without(off))
-    assert found.status is some.status is Status.OPTIMAL
-    assert found.bound == every.bound == some.bound
-    assert set(found.maps) == set(every.maps)
-    assert found.count == every.count
-    assert set(some.maps) <= set(every.maps)
-    assert some.count == len(set(some.maps)) == min(3, every.count)
-
-
 @pytest.mark.parametrize("most", [1, 2, 5])
 def test_as_many_maps_as_asked_for(most: int) -> None:
     """Spurs off a ring that look alike: with what is lazy, and what is held back, the number asked for comes, and no map twice."""
@@ -235,7 +203,7 @@ def test_dstates_that_are_one_are_merged() -> None:
 def test_a_limit_leaves_a_map_of_merged_steps() -> None:
     """Twice as good as one that is made at once, where clingo takes its time and no guess is annealed."""
     walk = maze(5, 5, steps=1600, seed=0)
-    with patch.multiple(named, PATIENCE=1, CORES=1), patch.object(named.NamedLabels, "_ask_one_by_one", side_effect=KeyboardInterrupt):
+    with patch.multiple(named, PATIENCE=1, CORES=1), patch.object(named.NamedLabels, "_more_links", side_effect=[[], KeyboardInterrupt]):
         solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,annealed,threads"))
     assert solution.status is Status.FEASIBLE
     assert solution.cost
@@ -262,14 +230,14 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
 @pytest.mark.parametrize("off", ["", "lazy"])
 def test_maps_found_before_a_limit_strikes_are_given(off: str) -> None:
     """Though they are held back until it is known that the links that clingo was given are enough; and the one that showed what is minimal, too."""
-    found = named.NamedLabels._all_of_bound
+    found = named.NamedLabels._answers_of
 
     def stopped(self: named.NamedLabels, spares: int) -> Iterator[dict[int, int]]:
         yield from islice(found(self, spares), 3)
         raise LimitError("time limit")
 
     walk = maze(3, 3, steps=200, seed=0)
-    with patch.object(named.NamedLabels, "_all_of_bound", stopped):
+    with patch.object(named.NamedLabels, "_answers_of", stopped):
         solution = solve(walk.trace, Theory.causal(), maps=100, speedups=Speedups.without(off))
     assert (solution.status, solution.stopped) == (Status.OPTIMAL, "time limit")
     assert solution.count == len(set(solution.maps)) >= 3

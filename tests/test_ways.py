@@ -12,6 +12,7 @@ from instances import maze
 from strategies import traces
 
 from ssh_abduction import Search, Speedups, Status, Theory, Trace, solve
+from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.engines import frameless as ways
 from ssh_abduction.engines import naming as named
 from ssh_abduction.engines.base import Task
@@ -60,6 +61,20 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
     assert len(found) == len(expected.maps)
     assert best.cost == expected.cost.preferred_by(theory)
     assert engine.bound == best.cost[0]
+
+
+def test_a_limit_while_labels_are_listed_is_a_limit() -> None:
+    """Labels with the fewest dstates are listed after a map with so few is known: that it is known ends the search for it, and not the list."""
+    trace = maze(3, 3, steps=30, seed=0).trace
+    theory = Theory.topological().resolve(trace)
+    known = solve(trace, theory).maps[0].labels
+    with patch.object(named, "SPARES", 0):
+        engine = FramelessEngine(Task.of(trace, theory), known)
+        engine.grow(len(trace))
+        maps = engine.improving_maps()
+        next(maps)
+        with patch.object(Watch, "allows", lambda _, seconds: not seconds), pytest.raises(LimitError, match="time limit"):
+            list(maps)
 
 
 @pytest.mark.parametrize("off", ["", "clique", "lazy", "core_guided", "framing"])

@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 import clingo
 
-from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import POLL, LimitError, Watch, peak_memory
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import Speedups
@@ -290,11 +289,11 @@ def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
     return result
 
 
-def new_control(encoding: str, base: str, options: Sequence[str], speedups: Speedups) -> Control:
+def new_control(encoding: str, base: str, options: Sequence[str]) -> Control:
     """A control with an encoding, and these facts in its base."""
     control = Control(options)
     control.load_encodings(encoding)
-    control.add("base", [], base if speedups.watched else f"{base}\n{facts.watched()}.")
+    control.add("base", [], base)
     control.ground([("base", [])])
     return control
 

@@ -240,11 +240,6 @@ def batch_facts(
     return "\n".join(facts)
 
 
-def watched() -> Symbol:
-    """The external atom that makes constraints of three literals longer, so that clasp looks at two of their literals only."""
-    return Function("watched")
-
-
 def resting(batch: int) -> Symbol:
     """The atom that some step of the batches up to this one is at the rest of its view. It is assumed, or assumed false, in a question."""
     return Function("resting", numbers(batch))

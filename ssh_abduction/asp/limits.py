@@ -9,6 +9,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Literal, TypeAlias
 
+from ssh_abduction.errors import SolverError, brief, is_finite
+
 # The search for minimal maps of prefixes ends when this share of the time limit is left. Until then it may have no map of the whole trace, and the rest of the
 # time is for finding one, minimal or not.
 RESERVE = 0.2
@@ -19,6 +21,12 @@ POLL = 0.05
 TICK = 0.5
 
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
+
+
+def check_limit(name: str, unit: str, limit: object) -> None:
+    """Raises SolverError where a limit that a caller gives is neither None nor a number above 0."""
+    if limit is not None and not (is_finite(limit) and limit > 0) and not (isinstance(limit, float) and limit == math.inf):
+        raise SolverError(f"{name}: expected a number of {unit} above 0, got {brief(limit)}; leave it out for none")
 
 
 class LimitError(Exception):

@@ -20,18 +20,11 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
 
-OF_STEPS = {
-    "view",
-    "act",
-    "kind",
-    "turns",
-    "open",
-    "excluded",
-    "elsewhere",
-    "one",
-}  # the predicates of a trace's facts, which come step by step
+# The predicates of a trace's facts, which come step by step.
+OF_STEPS = {"view", "act", "kind", "turns", "open", "excluded", "elsewhere", "one"}
 READABLE = {"axiom", "path", "prefer", "defeasible"}  # the predicates of a theory's facts
 PARTS = {"base": 0, "step": 1, "check": 1}  # the program parts that are grounded, with the number of their parameters
+TEXT = "<string>"  # what clingo calls a text that is no file
 ALLOWED = {ast.ASTType.Rule, ast.ASTType.Program, ast.ASTType.Definition, ast.ASTType.Defined, ast.ASTType.Comment}
 EXAMPLE = "% @axiom(brief) No dstate is seen again later.\n#program step(t).\nviolation(brief,t) :- same(I,t), t-I > 10."
 
@@ -41,27 +34,41 @@ def check_rules(theory: Theory) -> None:
     for rules in theory.rules:
         others = tuple(other for other in theory.rules if other is not rules)
         _check(rules, others, encodings.needed_by(vars(theory)))
+    if len(theory.rules) > 1:
+        _check_safety(*theory.rules)  # a constant may have one definition, in all files together
 
 
 @lru_cache(maxsize=64)
 def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> None:
     """Check one file of rules, which may use what the others and these encodings define."""
-    of_steps, known = _predicates(files)
+    of_steps, known, numbers = _predicates(files)
     statements = _statements(rules)
     own = {name for other in others for statement, _, _ in _statements(other) for name in _heads(statement)}
     own |= {name for statement, _, _ in statements for name in _heads(statement)}
     defined = {str(statement.name) for statement, _, _ in statements if statement.ast_type is ast.ASTType.Defined}
     named = {axiom.name for axiom in rules.axioms}
     for statement, part, parameter in statements:
-        where = f"{rules.name}:{statement.location.begin.line}"
+        begin = statement.location.begin
+        where = f"{rules.name}:{begin.line}"
+        if begin.filename != TEXT:
+            raise TheoryError(
+                f"{rules.name}: expected rules, got #include of {begin.filename}; give that file, too (--rules may be given again)"
+            )
         if statement.ast_type not in ALLOWED:
             raise TheoryError(f"{where}: expected rules, got {_short(statement)}; what is minimised and shown is chosen by the theory")
+        for function in _functions_of_python(statement):
+            raise TheoryError(f"{where}: expected what clingo works out by itself, got {function}, a function of Python's; say it in rules")
         if statement.ast_type is not ast.ASTType.Rule:
             continue
         for name in _heads(statement):
             if name in known - {"violation"}:
                 raise TheoryError(
                     f"{where}: expected a rule that reads {name}, got one that defines it; derive violation(name,t), or an atom of your own"
+                )
+        for atom in _derived(statement.head):
+            if atom.name == "violation" and len(atom.arguments) not in numbers["violation"]:
+                raise TheoryError(
+                    f"{where}: {atom}: expected {_counted(numbers['violation'])}, got {len(atom.arguments)}; derive violation(name,t)"
                 )
         for violated in _violations(statement):
             if violated not in named:
@@ -78,6 +85,8 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
                 raise TheoryError(
                     f"{where}: {name}: expected an atom that this theory has, got one that nothing defines; there are {', '.join(sorted(of_steps))}"
                 )
+            if name not in own | defined and len(atom.arguments) not in numbers.get(name, {len(atom.arguments)}):
+                raise TheoryError(f"{where}: {atom}: expected {_counted(numbers[name])}, got {len(atom.arguments)}")
             if (
                 name in of_steps
                 and not positive
@@ -89,7 +98,7 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
                     f"{where}: not {atom}: expected to be asked at a step, got a question that is asked before its steps are there; "
                     f"write {parameter} = {atom.arguments[-1]}, not {name}(…,{parameter}), in the body"
                 )
-    _ground(rules, others, files)
+    _check_safety(rules)
 
 
 def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
@@ -125,34 +134,32 @@ def _said(rules: Rules, messages: list[str]) -> str:
     )
 
 
-def _ground(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> None:
-    """Let clingo read the rules with the encodings: unsafe variables show only then."""
+def _check_safety(*files: Rules) -> None:
+    """Let clingo look at rules as it does before it grounds them: unsafe variables show only then. Nothing is grounded, as that may take long."""
     messages: list[str] = []
-    control = clingo.Control(
-        logger=lambda code, message: messages.append(message) if code is not clingo.MessageCode.AtomUndefined else None
-    )
-    for name in files:
-        control.load(encodings.path(name))
+    control = clingo.Control(logger=lambda _, message: messages.append(message))
     try:
-        for each in (*others, rules):
-            control.add("base", [], each.text)
-        zero = [clingo.Number(0)]
-        control.ground([("base", []), ("step", zero), ("check", zero)])
+        for rules in files:
+            control.add("base", [], rules.text)
+        control.ground([])
     except RuntimeError:
-        raise TheoryError(_said(rules, [m for m in messages if "error" in m] or messages)) from None
+        raise TheoryError(_said(files[-1], [m for m in messages if "error" in m] or messages)) from None
 
 
 @lru_cache(maxsize=8)
-def _predicates(files: tuple[str, ...]) -> tuple[frozenset[str], frozenset[str]]:
-    """The predicates of these encodings that are about steps, and all that they define."""
-    of_steps, known = set(OF_STEPS), set[str]()
+def _predicates(files: tuple[str, ...]) -> tuple[frozenset[str], frozenset[str], dict[str, frozenset[int]]]:
+    """The predicates of these encodings that are about steps; all that they define; and how many arguments each may have that they define or read."""
+    of_steps = set(OF_STEPS)
+    defined, numbers = set[str](), dict[str, set[int]]()
     for name in files:
         with open(encodings.path(name), encoding="utf-8") as file:
             for statement, part, _ in _statements(Rules(name, file.read())):
                 heads = set(_heads(statement))
-                known |= heads
+                defined |= heads
                 of_steps |= heads if part != "base" else set()
-    return frozenset(of_steps - {"violation"}), frozenset(known)
+                for atom, _ in _atoms_in(statement):
+                    numbers.setdefault(atom.name, set()).add(len(atom.arguments))
+    return frozenset(of_steps - {"violation"}), frozenset(defined), {name: frozenset(found) for name, found in numbers.items()}
 
 
 def _heads(statement: ast.AST) -> Iterator[str]:
@@ -206,6 +213,18 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
     for key in node.child_keys:
         child = getattr(node, key)
         yield from [child] if isinstance(child, ast.AST) else [part for part in child or () if isinstance(part, ast.AST)]
+
+
+def _functions_of_python(node: ast.AST) -> Iterator[ast.AST]:
+    """All terms below a node that clingo would ask Python for."""
+    if node.ast_type is ast.ASTType.Function and node.external:
+        yield node
+    for child in _children(node):
+        yield from _functions_of_python(child)
+
+
+def _counted(numbers: frozenset[int]) -> str:
+    return f"{' or '.join(map(str, sorted(numbers)))} arguments"
 
 
 def _is_settled(term: ast.AST, parameter: str) -> bool:

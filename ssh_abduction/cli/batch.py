@@ -95,6 +95,7 @@ class Question:
             return self.failed(number, path, error)
 
     def _solved(self, number: int, path: str, trace: Trace, given_up: Callable[[], bool]) -> Answer:
+        self.theory.check_steps(trace)
         if self.memory is not None:
             _forget_memory()
 

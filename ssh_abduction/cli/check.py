@@ -37,6 +37,7 @@ def run(options: argparse.Namespace) -> int:
     found = data.get("theory") if isinstance(data, dict) else None
     solved = None if found is None else Theory.from_dict(found)
     theory = theory_of(options, solved)
+    theory.check_steps(trace)
     maps = maps_of(data, str(options.maps))
     if not maps and not options.bound:
         raise MapError(

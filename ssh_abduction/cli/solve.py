@@ -58,11 +58,13 @@ def run(options: argparse.Namespace) -> int:
 
         return batch.run(options)
     trace = Trace.load(options.traces[0])
+    theory = theory_of(options)
+    theory.check_steps(trace)
     with contextlib.ExitStack() as until_printed:
         with _progress(trace, options.json) as on_progress:
             search = Search(
                 trace,
-                theory_of(options),
+                theory,
                 limit=options.time_limit,
                 maps=options.maps,
                 memory=options.memory_limit,

@@ -40,7 +40,7 @@ from ssh_abduction.asp.process import in_process
 from ssh_abduction.engines.base import Found, Task, next_charted_size
 from ssh_abduction.engines.nearby import Beside, NearbySearch
 from ssh_abduction.engines.paths import Paths
-from ssh_abduction.engines.refusing import all_accepted
+from ssh_abduction.engines.refusing import all_accepted, first_accepted_of
 from ssh_abduction.engines.sides import FramedSides
 from ssh_abduction.engines.visits import OPEN, VisitLabels, smaller
 from ssh_abduction.guesses.merging import kept
@@ -170,14 +170,20 @@ class FramedEngine:
 
     def _first_with_paths(self) -> Generator[Found, None, _Fitted | None]:
         """The first labels with the fewest dstates that have paths; where they take long, maps that are soon found come before."""
-        while (labels := self._visits.fewest(self._should_interrupt)) is not None:
-            if labels is OPEN:
+        fitted: list[_Fitted] = []
+
+        def ask() -> Generator[Found, None, list[int] | None]:
+            while (labels := self._visits.fewest(self._should_interrupt)) is OPEN:
                 yield from self._maps_found_soon()
-            elif (fitted := self._some_paths(labels)) is not None:
-                return fitted
-            else:
-                self._forbid(labels)
-        return None
+            return labels
+
+        def why_not(labels: list[int]) -> list[int] | None:
+            found = self._some_paths(labels)
+            fitted.extend([found] if found else [])
+            return None if found else labels
+
+        yield from first_accepted_of(ask, why_not, self._forbid)
+        return fitted[0] if fitted else None
 
     def _maps_found_soon(self) -> Iterator[Found]:
         """Maps near a guess, once; and then what came of the search beside this one."""

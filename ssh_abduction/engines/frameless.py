@@ -183,7 +183,6 @@ class PlacesAndPaths:
         with self._asker.grounding_timed():
             control, names = self._asker.control, self.named.names()
             parts: list[tuple[str, list[clingo.Symbol]]] = []
-            self.named.end_begun()
             if not self._told:
                 control.load(encodings.path("sides_frameless"))
                 control.add("ways", [], facts.way_facts(self._task.theory, self._actions))
@@ -192,8 +191,12 @@ class PlacesAndPaths:
             control.ground(parts)  # in one go: that takes half as long, and searching, too
             self._told.update(dstates)
 
-    def why_not(self, labels: Sequence[int]) -> Sequence[int] | None:
-        return None if self._has_courses(self._least_courses(labels)) else labels
+    def fits(self, labels: Sequence[int]) -> bool:
+        return self._has_courses(self._least_courses(labels))
+
+    def why_not(self, labels: list[int]) -> list[int] | None:
+        """Labels that no places and paths fit; None where some do."""
+        return None if self.fits(labels) else labels
 
     def _has_courses(self, control: clingo.Control) -> bool:
         return next(self._asker.answers(lambda _: True, "ignore", 1, control=control), False)

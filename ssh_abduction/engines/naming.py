@@ -13,15 +13,10 @@ reaches it. ∎ A minimal answer that does use a rest is asked for again, with o
 
 Not every step is needed. The control starts with the links of the pinned steps; an answer is followed along the trace, and the links
 at which it fails are added, until one holds everywhere. That is a relaxation until then, so its bounds hold. Where clingo does not
-answer soon, what is missing is rather more knowledge than less, and all links are given at once. With the steps clingo is told which pairs
-of them are apart, where more than one action shows it: no two of these are at one name. The links say so, too, but only once it is
-chosen where they lead.
+answer soon, what is missing is rather more knowledge than less, and all links are given at once.
 
 clasp raises the bound core by core: a core is a set of spare names that cannot all be left unused. Cores are small at first, as the names
-of a view are its own: what different corners of the world need adds up. Raising the bound by cores stalls when what is missing can be
-spread over many views: every core is then about all of them. After CORES conflicts the numbers of dstates are asked for one by one instead,
-from the bound up: is there an answer that costs no more? If there is none, the bound is one higher. The first answer without a rest is a
-minimal map, as it costs what the bound is; the same search then goes on with the other maps.
+of a view are its own: what different corners of the world need adds up.
 
 Of a long trace, whose steps are too many to be compared in pairs, as many are taken as it takes for the clique to be as large as that of all; and what
 conflicts ask for is given a thousand links at a time.
@@ -30,7 +25,7 @@ Beside all that small maps are sought in a thread of its own. First steps are me
 leaves a map that is not bad; then a map is guessed, of places with frames where the trace lets itself be taken for one of these
 (`guesses/annealing.py`), and smaller ones are sought near it (`engines/nearby.py`). Of a long trace the beginning is guessed, and what
 comes of that followed along the rest (`guesses/continuing.py`). Whatever bound meets these maps ends the search. Where there is but one
-processor, steps are merged at once, and the guess waits until raising the bound by cores has stalled. Where there is no such search, clasp
+processor, steps are merged at once, and the guess waits until raising the bound by cores takes long. Where there is no such search, clasp
 has the second processor: two threads, which tell each other what they learn. Which minimal maps come first may then differ from run to run;
 all of them are the same.
 
@@ -43,8 +38,9 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from itertools import chain, islice
-from typing import Any, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import clingo
 import numpy as np
@@ -54,23 +50,33 @@ from ssh_abduction.asp.control import Asker, give_threads, new_control
 from ssh_abduction.asp.limits import POLL, LimitError, Watch
 from ssh_abduction.engines.base import AT_ONCE, Task
 from ssh_abduction.engines.nearby import AT_A_TIME, SECONDS_A_CHARACTER, Beside, NearbySearch, mended
-from ssh_abduction.engines.refusing import first_accepted
+from ssh_abduction.engines.refusing import first_accepted_of
 from ssh_abduction.guesses.annealing import annealed, annealed_steps
 from ssh_abduction.guesses.continuing import followed
 from ssh_abduction.guesses.merging import merged, merged_near, thinned
-from ssh_abduction.steps.apart import Continuations, Matrix
+from ssh_abduction.steps.apart import Continuations
 from ssh_abduction.steps.chart import Chart, Link, numbered
 
-HELD_BACK = 100  # maps that are kept until all links are given; then they stream
-PREPARING = 0.6  # of the time that grounding took, clingo takes before it begins to solve, and can be stopped
-SPARES = 2  # spare names of a view, to begin with
-PATIENCE = 2000  # conflicts after which more links are given
-MORE_LINKS = 1000  # of a long trace, that clingo is given then; of others all
-CORES = 10_000  # conflicts after which, with all links, numbers of dstates are asked for one by one
-GUESSES = 10  # that are waited for until one is a map, where the robot does not turn
-GUESSED = 24_000  # steps that are guessed in one go, at most
-WHOLE = 100_000  # steps that are taken at once, at most, if more of them are apart then
-TRIES = 3  # how often a map near a guess is sought with more conflicts, where nothing goes on beside that
+# So many maps are kept until clingo was given all links; then they stream. Until then each answer may turn out to need a link that clingo does not know.
+HELD_BACK = 100
+# Clingo takes so much of the time that grounding took before it begins to solve, and can be stopped.
+PREPARING = 0.6
+# So many spare names a view has to begin with: one that is used, and one that shows that no more are needed.
+SPARES = 2
+# After so many conflicts clingo is given more links: that few do not decide much by themselves shows soon.
+PATIENCE = 2000
+# So many links of a long trace clingo is given then; of others it is given all, as few are left.
+MORE_LINKS = 1000
+# After so many conflicts with all links, and where there is but one processor, a map near a guess is sought before clingo goes on.
+CORES = 10_000
+# So many guesses are made until one is a map, where the robot does not turn: each costs as much as the first, and few are better.
+GUESSES = 10
+# So many steps of a long trace are taken at once, at most, if more of them are apart then: the clique of more takes minutes.
+WHOLE = 100_000
+# So many steps of a long trace are guessed in one go, at most: more take minutes.
+GUESSED = 24_000
+# So often a map near a guess is sought with more conflicts where nothing goes on beside that: later tries rarely find a smaller one.
+TRIES = 3
 
 
 _Trail: TypeAlias = "tuple[Link, _Trail] | None"
@@ -79,8 +85,8 @@ _Trail: TypeAlias = "tuple[Link, _Trail] | None"
 class Fitting(Protocol):
     """What asks more of labels than the causal theory does (`engines/frameless.py`)."""
 
-    def why_not(self, labels: Sequence[int]) -> Sequence[int] | None:
-        """Labels that are not those of a map, though each action leads to one dstate; None where they are."""
+    def fits(self, labels: Sequence[int]) -> bool:
+        """Whether labels by which each action leads to one dstate are those of a map."""
         ...
 
     def forbid(self, labels: Sequence[int]) -> None:
@@ -106,6 +112,23 @@ def _may_be(chart: Chart, clique: Sequence[int]) -> list[list[int]]:
     return [(~row).nonzero()[0].tolist() for row in apart]
 
 
+@dataclass
+class _Answer:
+    """The names of the steps that clingo was told of, and, once they were followed, the labels of all steps."""
+
+    names: dict[int, int]
+    labels: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Lacking:
+    """What clingo has to be told, one of these: views that need another name, links that were not kept, or labels that do not fit."""
+
+    views: Collection[int] = ()
+    links: Collection[Link] = ()
+    labels: Sequence[int] = ()
+
+
 class NamedLabels:
     """Labels of the first steps of a trace with the fewest dstates, which have names.
 
@@ -125,9 +148,10 @@ class NamedLabels:
         self.known: list[int] | None = None
         self.size = 0
         self._task, self._asker, self._given_map, self._fitting = task, asker, given_map, fitting
-        self._hard = self._one_by_one = False  # whether few conflicts were not enough, and whether raising the bound by cores stalled
+        self._hard = False  # whether few conflicts were not enough
+        self._searched_alone = False  # whether small maps were sought with nothing beside
+        self._seeking = False  # whether the fewest dstates are being sought
         self._beside: Beside | None = None  # a search for a map near a guess, in another thread
-        self._begun: Generator[dict[int, int], None, bool] | None = None  # goes on after the answer that showed the bound to be the minimum
         self._forbidden: list[list[tuple[int, int]]] = []  # sets of pairs of steps, of each of which some pair is not one dstate
 
     def large_enough(self, size: int) -> int:
@@ -166,7 +190,7 @@ class NamedLabels:
         self.clique = self.chart.continuations.clique() if self._task.speedups.clique else [0]
         self._asker.watch.check()
         self._may_be = _may_be(self.chart, self.clique)
-        self._one_by_one = self._hard = False
+        self._hard = self._searched_alone = False
         self.known = numbered(self._given_map[:size]) or None
         self._spares = self._first_spares()
         self._links = dict.fromkeys(self.chart.links)
@@ -182,21 +206,12 @@ class NamedLabels:
         pinned = Counter(seen[node] for node in self.clique)
         return {view: max(SPARES, found[view] - pinned[view] + 1) if self._given_map else SPARES for view in dict.fromkeys(seen)}
 
-    def _far(self, node: int) -> Matrix:
-        """Which nodes are apart from this one, as more than one action shows, or as evidence says."""
-        continuations = self.chart.continuations
-        return continuations.apart_from(node, actions=2) if self._task.speedups.apart else continuations.excluded_from(node)
-
-    @property
-    def _tells_far(self) -> bool:
-        """Whether clingo is told which nodes are apart."""
-        return self._task.speedups.apart or bool(self.chart.excluded)
-
     def improving(self) -> Iterator[list[int]]:
         """Labels of all nodes, the last ones with the fewest dstates; before, if that takes its time, some that have few."""
         if not self.chart.links:
             yield [0]
             return
+        self._seeking = True
         try:
             for labels in self._searched():
                 if self._is_allowed(labels):
@@ -209,59 +224,75 @@ class NamedLabels:
             if isinstance(end, KeyboardInterrupt) or not self._is_settled():
                 raise
         finally:
+            self._seeking = False
             self._end_beside()
 
     def _searched(self) -> Iterator[list[int]]:
         """The same, by the search here; it ends early where the one beside it has the fewest dstates."""
-        while not self._one_by_one:
-            lazy = not self.has_all_links
-            answer, proven = self._cheapest(PATIENCE if lazy else CORES if self._task.speedups.one_by_one else -1)
-            if not proven or answer is None:
-                if not self._hard:
-                    self._hard = True
-                    yield from self._search_nearby()
-                if not lazy and not self._task.has_processors:
-                    yield from self._search_alone()
-                if self._is_settled():
-                    self._end_beside()
-                    yield self.known or []
-                    return
-                if not lazy:
-                    self._ask_one_by_one()
-                    continue
-                self.add(self._more_links())
-                self._configure()
-            elif not self._named_more(answer):
-                self._raise_bound([sum(name >= len(self.clique) for name in set(answer.values()))])
-                labels, failed = self._follow(answer)
-                if failed:
-                    self.add(failed)
-                elif (reason := self._why_not(labels)) is None:
-                    yield labels
-                    return
-                else:
-                    self._forbid(reason)
-        fewest = first_accepted(self._first_labels_of_bound, self._why_not, self._forbid)
-        if fewest is None:
+        found = yield from first_accepted_of(self._cheapest_answer, self._why_not, self._tell_why)
+        if found is None:
             self._end_beside()
-        yield fewest or self.known or []
+        yield found.labels if found else self.known or []
+
+    def _cheapest_answer(self) -> Generator[list[int], None, _Answer | None]:
+        """The cheapest answer by what clingo was told; before, if that takes its time, labels that are found otherwise. None where these are as good as the bound."""
+        while True:
+            names, proven = self._cheapest(self._patience)
+            if proven and names is not None:
+                return _Answer(names)
+            yield from self._helped()
+            if self._is_settled():
+                return None
+            self.add(self._more_links())
+            self._configure()
+
+    def _why_not(self, answer: _Answer) -> _Lacking | None:
+        """What clingo has to be told, as an answer shows; None where it says which dstates a map has."""
+        if views := self._rests(answer.names):
+            return _Lacking(views=views)
+        self._raise_bound([sum(name >= len(self.clique) for name in set(answer.names.values()))])
+        answer.labels, failed = self._follow(answer.names)
+        if failed:
+            return _Lacking(links=failed)
+        return None if self._fitting is None or self._fitting.fits(answer.labels) else _Lacking(labels=answer.labels)
+
+    def _tell_why(self, lacking: _Lacking) -> None:
+        if lacking.views:
+            self._name_more(lacking.views)
+        elif lacking.links:
+            self.add(lacking.links)
+        elif self._fitting:
+            self._fitting.forbid(lacking.labels)
+
+    @property
+    def _patience(self) -> int:
+        """After how many conflicts something else is done; -1 for never."""
+        if not self.has_all_links:
+            return PATIENCE
+        return -1 if self._searched_alone or self._task.has_processors or not self._may_search_nearby else CORES
+
+    def _helped(self) -> Iterator[list[int]]:
+        """Labels of small maps, by other means than clingo's search for the fewest dstates, which takes long."""
+        if self._may_search_nearby and not self._hard:
+            yield from self._search_nearby()
+        self._hard = True
+        if self.has_all_links and self._may_search_nearby and not self._searched_alone and not self._task.has_processors:
+            self._searched_alone = True
+            yield from self._search_alone()
 
     def _cheapest(self, conflicts: int) -> tuple[dict[int, int] | None, bool]:
         """The best answer that clingo finds with so many conflicts, and whether it is proven to be the best."""
         answer = None
-        answers = self._asker.answers(facts.read_names, "opt", 0, conflicts=conflicts, on_bound=self._raise_bound, until=self._is_settled)
+        answers = self._asker.answers(facts.read_names, "opt", 0, conflicts=conflicts, on_bound=self._raise_bound, until=self._may_end)
         while True:
             try:
                 answer = next(answers)
             except StopIteration as end:
                 return answer, bool(end.value)
 
-    def _why_not(self, labels: Sequence[int]) -> Sequence[int] | None:
-        return self._fitting.why_not(labels) if self._fitting else None
-
-    def _forbid(self, labels: Sequence[int]) -> None:
-        assert self._fitting is not None
-        self._fitting.forbid(labels)
+    def _may_end(self) -> bool:
+        """Whether a map with as few dstates as the bound is known already, while one is sought. What lists all of them goes on."""
+        return self._seeking and self._is_settled()
 
     def _is_allowed(self, labels: Sequence[int]) -> bool:
         """Whether labels keep what evidence says of pairs of steps. That each action leads to one dstate by them is known."""
@@ -289,14 +320,16 @@ class NamedLabels:
 
     def tell(self, part: str, rules: str) -> None:
         """Give clingo rules in a program part of this name."""
-        self.end_begun()
         self._asker.control.add(part, [], rules)
         self._asker.control.ground([(part, [])])
 
+    @property
+    def _may_search_nearby(self) -> bool:
+        """Whether small maps may be sought by other means than clingo: what fits the causal theory need not fit one that asks for more."""
+        return self._fitting is None and (self._task.speedups.greedy or self._task.speedups.annealed)
+
     def _search_nearby(self) -> Iterator[list[int]]:
         """Begin to search for small maps in another thread; where there is but one processor, give a map merged by evidence."""
-        if self._fitting or not (self._task.speedups.greedy or self._task.speedups.annealed):
-            return  # what fits the causal theory need not fit one that asks for more
         if self._task.has_processors:
             watch = Watch(beside=self._asker.watch)
             search = self._nearby(watch)
@@ -307,8 +340,6 @@ class NamedLabels:
 
     def _search_alone(self) -> Iterator[list[int]]:
         """Search for small maps near a guess for a while, with nothing beside it."""
-        if self._fitting:
-            return
         if self._is_long:
             yield from _ever_fewer(self._from_beginning(self._asker.watch.check), self.known)
             return
@@ -323,7 +354,7 @@ class NamedLabels:
             chart=self.chart,
             clique=self.clique,
             may_be=self._may_be,
-            far=self._far if self._tells_far else None,
+            far=self.chart.continuations.excluded_from if self.chart.excluded else None,
             configuration="tweety",
         )
 
@@ -415,51 +446,15 @@ class NamedLabels:
         pinned = {(-1, name): name for name in range(len(self.clique))}
         return pinned | {(view, i): name for view, spare in self._spare.items() for i, name in enumerate(spare[:-1])}
 
-    def _ask_one_by_one(self) -> None:
-        self._one_by_one = True
-        self._configure()
-
     def _configure(self) -> None:
         """Let clasp search as suits what is asked, and how hard it turned out to be."""
-        configuration: Any = self._asker.control.configuration
-        if self._one_by_one:
-            configuration.configuration, configuration.sat_prepro = "crafty", "no"
         if self._hard and not (self._beside and self._beside.running) and self._task.has_processors:
             give_threads(self._asker.control, two=True)
 
-    def _first_labels_of_bound(self) -> list[int] | None:
-        """The labels of `_first_of_bound`."""
-        answer = self._first_of_bound()
-        return None if answer is None else self._follow(answer)[0]
-
-    def _first_of_bound(self) -> dict[int, int] | None:
-        """Raise the bound until there is an answer that costs no more. All links are given. None where the search beside this one ended that."""
-        self.end_begun()
-        while True:
-            spares = (self.bound or 0) - len(self.clique)
-            answers = self._asker.answers(self._reader().read, f"enum,{spares},{spares}", 0, until=self._is_settled, ahead=True)
-            answer = next(answers, None)
-            if answer is None and self._is_settled():
-                return None
-            if answer is None:
-                self._raise_bound([spares + 1])
-            elif self._rests(answer):
-                answers.close()
-                self._named_more(answer)
-            else:
-                self._begun = answers
-                self._first = answer
-                return answer
-
-    def _all_of_bound(self, spares: int) -> Iterator[dict[int, int]]:
-        """All answers of this cost that use no rest, where a search for them has begun from there on."""
-        if self._begun is None:
-            read = self._reader().read if self.has_all_links else facts.read_names
-            yield from self._asker.answers(read, f"enum,{spares},0", 0, assumptions=[self._resting(False)], ahead=True)
-            return
-        begun, self._begun = self._begun, None
-        yield self._first
-        yield from (answer for answer in begun if not self._rests(answer))
+    def _answers_of(self, spares: int) -> Iterator[dict[int, int]]:
+        """All answers that cost so many spare names and use no rest."""
+        read = self._reader().read if self.has_all_links else facts.read_names
+        return self._asker.answers(read, f"enum,{spares},0", 0, assumptions=[self._resting(False)], ahead=True)
 
     def _reader(self) -> facts.NameReader:
         return facts.NameReader(self._task.log.actions[: self.size - 1], self._choices, self._rest)
@@ -470,15 +465,8 @@ class NamedLabels:
         return len(self._links) == len(self.chart.links)
 
     def settle(self) -> None:
-        """End what is still under way in clingo, here and beside this."""
-        self.end_begun()
+        """End the search beside this one."""
         self._end_beside()
-
-    def end_begun(self) -> None:
-        """End the search that goes on after an answer, before clingo is told more."""
-        if self._begun is not None:
-            self._begun.close()
-            self._begun = None
 
     def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
         """All ways to name the nodes with so many dstates; or `enough` of them, unless that is 0. One that is known comes first."""
@@ -497,8 +485,6 @@ class NamedLabels:
         if not self.chart.links:
             yield [0]
             return
-        if not enough or self.bound != dstates:
-            self.end_begun()
         while True:
             while not enough and self._needs_rest(spares):  # asked again when nodes were added, as these may be at a rest
                 pass
@@ -506,7 +492,7 @@ class NamedLabels:
             failed: Iterable[Link] = ()
             lazy = not self.has_all_links
             try:
-                for answer in self._all_of_bound(spares):
+                for answer in self._answers_of(spares):
                     labels, failed = self._follow(answer)
                     if failed:
                         break
@@ -532,7 +518,10 @@ class NamedLabels:
     def _needs_rest(self, spares: int) -> bool:
         """Take more spare names, if some answer of this cost uses a rest. Says whether it was so."""
         answer = next(self._asker.answers(facts.read_names, f"enum,{spares},{spares}", 1, assumptions=[self._resting(True)]), None)
-        return answer is not None and self._named_more(answer)
+        views = self._rests(answer) if answer else set()
+        if views:
+            self._name_more(views)
+        return bool(views)
 
     def _resting(self, value: bool) -> tuple[clingo.Symbol, bool]:
         """The assumption that some node is at a rest, or that none is."""
@@ -555,7 +544,6 @@ class NamedLabels:
 
     def _take_control(self) -> None:
         """Take a control that knows the names, and no step yet."""
-        self.end_begun()
         seen = self.chart.seen
         names = [(name, seen[node]) for name, node in enumerate(self.clique)]
         spares = self._spare = dict[int, list[int]]()
@@ -570,7 +558,7 @@ class NamedLabels:
         cores = ["--opt-strategy=usc"] if self._task.speedups.core_guided else []
         base = facts.name_facts(names, spares.values(), self.chart.links, self._choices)
         self._check_ahead(SECONDS_A_CHARACTER * len(base))
-        self._asker.control = new_control("names", base, ["--eq=1", *cores], self._task.speedups)
+        self._asker.control = new_control("names", base, ["--eq=1", *cores])
         self._configure()
         self._given: set[int] = set()  # nodes
         self._open = np.zeros(len(seen), dtype=bool)  # whether a node is one of them, and not pinned
@@ -604,7 +592,8 @@ class NamedLabels:
                 given.append((t, view, self._choices[t], self._last.get(view)))
                 if len(self._choices[t]) > 1:
                     self._last[view] = t
-                    far += [(t, int(u)) for u in np.flatnonzero(self._far(t) & self._open)] if self._tells_far else []
+                    if self.chart.excluded:
+                        far += [(t, int(u)) for u in np.flatnonzero(self.chart.continuations.excluded_from(t) & self._open)]
                     self._open[t] = True
         self._links.update(dict.fromkeys(added))
         part, batch = f"batch_{self._batches}", self._batches
@@ -613,14 +602,11 @@ class NamedLabels:
         self._asker.control.ground([("more", facts.numbers(batch))])
         self._batches += 1
 
-    def _named_more(self, answer: dict[int, int]) -> bool:
-        """Take more spare names for the views of which the answer uses the rest. Says whether there were any."""
-        used = self._rests(answer)
-        for view in used:
+    def _name_more(self, views: Collection[int]) -> None:
+        """Take one more spare name for each of these views."""
+        for view in views:
             self._spares[view] += 1
-        if used:
-            self._restart()
-        return bool(used)
+        self._restart()
 
     def _rests(self, answer: dict[int, int]) -> set[int]:
         """The views of which the answer uses the rest."""

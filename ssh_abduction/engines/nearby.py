@@ -159,7 +159,7 @@ class NearbySearch:
         links = self._chart.links
         base = facts.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
         self._asker.watch.check(SECONDS_A_CHARACTER * len(base))
-        self._asker.control = new_control("names", base, ["--eq=1"], self._speedups)
+        self._asker.control = new_control("names", base, ["--eq=1"])
         if self._configuration:
             configuration: Any = self._asker.control.configuration
             configuration.configuration, configuration.sat_prepro = self._configuration, "no"

@@ -12,6 +12,7 @@ from typing import TypeVar
 
 Answer = TypeVar("Answer")
 Reason = TypeVar("Reason")
+Meanwhile = TypeVar("Meanwhile")
 
 
 def first_accepted(
@@ -24,6 +25,20 @@ def first_accepted(
     forbid  what lets answers not be given again for this reason
     """
     while (answer := ask()) is not None:
+        reason = refuse(answer)
+        if reason is None:
+            return answer
+        forbid(reason)
+    return None
+
+
+def first_accepted_of(
+    ask: Callable[[], Generator[Meanwhile, None, Answer | None]],
+    refuse: Callable[[Answer], Reason | None],
+    forbid: Callable[[Reason], None],
+) -> Generator[Meanwhile, None, Answer | None]:
+    """The same as `first_accepted`, where asking takes long: what is found meanwhile is yielded, and the answer is what `ask` returns."""
+    while (answer := (yield from ask())) is not None:
         reason = refuse(answer)
         if reason is None:
             return answer

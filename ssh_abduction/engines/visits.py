@@ -18,7 +18,7 @@ takes. Fewer visits are a relaxation, and an answer that says where all visits a
 avoided, raises the bound by one; from then on it is asked that at most one of them is alone, then two, and so on (OLL: Andres,
 Kaufmann, Matheis, Schaub 2012, "Unsatisfiability-based optimization in clasp"). Each optimum of the whole holds what is asked for
 in the end, so these answers are all minimal ones. clasp has that built in, but begins anew with each call, and an answer that
-fails to be transitive is a call. Cores are made small as long as that is cheap: small ones are about one part of the world.
+fails to be transitive is a call.
 
 *Near a guess.* Where that takes long, some map is known soon: clingo is asked for answers in which visits are one that are one in the map made
 of a guess. They need not have the fewest dstates. But where they have as few as the bound, they do.
@@ -174,7 +174,7 @@ class VisitLabels:
     def _begin(self, chart: FramedChart) -> None:
         """Take a control that knows nothing, for visits of a chart."""
         self._first_nodes = len(chart.seen)
-        self._asker.control = new_control("visits", "", ["--heuristic=Domain"], self._task.speedups)
+        self._asker.control = new_control("visits", "", ["--heuristic=Domain"])
         self.batch = -1
         self._visits: set[int] = set()  # that clingo knows, and of these
         self._place_of: dict[int, int] = {}  # where nodes are in the order of choice
@@ -301,7 +301,7 @@ class VisitLabels:
                 return _Answer(pairs_found or (), is_open=pairs_found is None)
             if not core:
                 return None
-            self._relax(self._smaller(core) if self._task.speedups.small_cores else core)
+            self._relax(core)
 
     def _pairs(self, model: clingo.Model) -> list[Pair]:
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
@@ -313,10 +313,6 @@ class VisitLabels:
             if atom := atoms[facts.same(pair)]:
                 self._transitive.literals[pair] = atom.literal
         self._unread = []
-
-    def _smaller(self, core: list[int]) -> list[int]:
-        """A core of fewer members, as long as that is cheap."""
-        return smaller(core, lambda part: self._asker.verdict(lambda _: None, part, TRY_CONFLICTS)[1], FAILED_TRIES)
 
     def _relax(self, core: Sequence[int]) -> None:
         """As not all members of a core can be avoided, ask only that no two of them are there."""

@@ -25,9 +25,10 @@ from functools import cached_property, partial
 from graphlib import CycleError, TopologicalSorter
 from typing import TypeAlias
 
+from ssh_abduction.errors import MapError, brief
 from ssh_abduction.maps import DState, SSHMap
-from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Action, Openings, Trace, View
+from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.trace import Action, Openings, Trace, View, checked_trace
 
 COHERENCE = "map_explains_trace"
 QUARTERS = {"right": 1, "around": 2, "left": 3}
@@ -65,13 +66,15 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
 
     Raises
     ------
-    TraceError and TheoryError where the trace lacks what the theory asks for. Nothing in the map makes it raise.
+    TraceError and TheoryError where the trace lacks what the theory asks for; MapError for what is no SSHMap. Nothing else in the map makes it raise.
 
     References
     ----------
     Kuipers & Beeson, AAAI 2002; Remolina & Kuipers, AIJ 2004; docs/theory.md has the axioms one by one.
     """
-    theory = (theory or Theory.topological()).resolve(trace)
+    theory = checked_theory(theory).resolve(checked_trace(trace))
+    if not isinstance(ssh_map, SSHMap):
+        raise MapError(f"map: expected an SSHMap, got {brief(ssh_map)}; take one of a solution, or SSHMap.load")
     reading = _Reading(trace, ssh_map, theory)
     checks = [(COHERENCE, test) for test in _COHERENCE] + [(name, AXIOMS[name]) for name in theory.axioms if name in AXIOMS]
     return tuple(Violation(name, tuple(sorted(set(steps))), message) for name, test in checks for steps, message in test(reading))

@@ -18,6 +18,7 @@ from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.theory import COUNTS, Theory
 
 STATUSES = ("optimal", "feasible", "unsatisfiable", "unknown")
+REASONS = ("time limit", "memory limit", "interrupted", "maps limit")  # why a search may have been stopped
 
 
 def false_claims(answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int) -> tuple[str, ...]:
@@ -72,6 +73,8 @@ class _Claims:
                 yield f"status: expected {expected}, got {status}"
             elif status == "feasible" and len(self.maps) > 1:
                 yield f"maps: expected one, as the status is feasible, got {len(self.maps)}"
+        if stopped is not None and stopped not in REASONS:
+            yield f"stopped: expected one of {', '.join(REASONS)}, got {brief(stopped)}"
         if "complete" not in self.answer:
             return
         if not isinstance(complete, bool):
@@ -116,6 +119,9 @@ class _Claims:
             yield f"bound: expected numbers of {', '.join(COUNTS)}, got {brief(bound)}"
             return
         for name, value in bound.items():
+            if name not in ("dstates", self.first):
+                preferred = f"the theory minimises {self.first} first" if self.first else "the theory prefers nothing"
+                yield f"bound: expected none of {name}, as {preferred}, got {value}"
             below = [i for i, counts in enumerate(self.counts) if counts[name] < value]
             if below and not self.theory.without:
                 yield f"bound: expected at most {self.counts[below[0]][name]} {name}, as map {below[0] + 1} has no more, got {value}"

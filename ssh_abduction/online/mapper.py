@@ -43,6 +43,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from ssh_abduction.asp.limits import check_limit
 from ssh_abduction.engines.base import AT_ONCE, Cost
 from ssh_abduction.errors import TraceError, brief
 from ssh_abduction.guesses.tree import Sketch
@@ -52,8 +53,8 @@ from ssh_abduction.solver.result import Seconds, Solution, Status
 from ssh_abduction.solver.search import ALL, Search
 from ssh_abduction.steps.log import Outcome, observation
 from ssh_abduction.theory.evidence import Pairs, pairs_of
-from ssh_abduction.theory.speedups import Speedups, row
-from ssh_abduction.theory.theory import Theory
+from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
+from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Action, Step, Trace, View
 
 if TYPE_CHECKING:
@@ -89,7 +90,9 @@ class OnlineMapper:
         speedups: Speedups = ALL,
     ) -> None:
         first = Step.of(view, star, "step 0")
-        theory = theory or Theory.topological()
+        theory = checked_theory(theory)
+        check_limit("limit", "seconds", limit)
+        checked_speedups(speedups)
         self.theory = theory.resolve(Trace((first,)))
         if theory.level == "causal":  # now rather than at the step that first needs it, as it takes its time
             importlib.import_module("ssh_abduction.engines.causal")

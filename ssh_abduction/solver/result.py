@@ -98,7 +98,7 @@ class Solution:
 
     @property
     def noise(self) -> Noise | None:
-        """The step that looks like noise, as nearly all steps before it are dstates of their own because of it alone; None where none does.
+        """The step that looks like noise, as most steps before it are dstates of their own because of it alone; None where none does.
 
         Worked out when it is first asked for.
         """

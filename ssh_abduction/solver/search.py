@@ -47,11 +47,11 @@ from typing import Any
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Grounding
-from ssh_abduction.asp.limits import LimitError, StageTimeError, Stop, Watch
+from ssh_abduction.asp.limits import LimitError, StageTimeError, Stop, Watch, check_limit
 from ssh_abduction.asp.rules import check_rules
 from ssh_abduction.engines.base import AT_ONCE, Engine, Task
 from ssh_abduction.engines.stepwise import StepEngine
-from ssh_abduction.errors import SolverError, TheoryError, TraceError, brief
+from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.candidates import FRAMING_SHARE, Candidates
@@ -60,9 +60,9 @@ from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.result import Bound, Progress, Seconds, Solution, Status
 from ssh_abduction.steps.certificate import Basis
-from ssh_abduction.theory.speedups import Speedups, row
-from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
+from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
+from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.trace import Trace, checked_trace
 
 FEW_STEPS = 24  # Traces up to this length skip names, greedy maps and bounds from below: solving them directly is faster.
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.
@@ -96,17 +96,10 @@ def solve(
     Ctrl-C ends the search like a limit does. Raises TraceError or TheoryError where the trace lacks what the theory needs.
     Source: Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
-    if choices:
-        theory = _checked(theory).replace(**choices)
+    theory = checked_theory(theory).replace(**choices)
+    theory.check_steps(checked_trace(trace))
     search = Search(trace, theory, limit=limit, maps=maps, memory=memory, speedups=speedups, on_progress=on_progress)
     return search.solution(tuple(search))
-
-
-def _checked(theory: Theory | None) -> Theory:
-    """The theory that a caller gives, or the default. Raises TheoryError."""
-    if not isinstance(theory, Theory | None):
-        raise TheoryError(f"theory: expected a Theory, got {brief(theory)}; take Theory.topological(), Theory.causal() or Theory(…)")
-    return theory or Theory.topological()
 
 
 class Search:
@@ -131,27 +124,23 @@ class Search:
         after: Search | None = None,
         minimal: SSHMap | None = None,
     ) -> None:
-        if not isinstance(trace, Trace):
-            raise TraceError(f"trace: expected a Trace, got {brief(trace)}; make one with Trace.load or Trace.from_steps")
+        checked_trace(trace)
         if isinstance(maps, bool) or not hasattr(maps, "__index__"):
             raise SolverError(f"maps (--maps): expected a whole number, 0 for all, got {brief(maps)}")
-        for name, value in (("limit (--time-limit)", limit), ("memory (--memory-limit)", memory)):
-            if isinstance(value, bool) or not isinstance(value, int | float | None):
-                raise SolverError(f"{name}: expected a number, got {brief(value)}")
-        if limit is not None and not limit > 0:
-            raise SolverError(f"limit (--time-limit): expected a number of seconds above 0, got {brief(limit)}; leave it out for none")
         if maps < 0:
             raise SolverError(f"maps (--maps): expected 0 (all) or more, got {maps}")
-        if memory is not None and memory <= 0:
-            raise SolverError(f"memory (--memory-limit): expected a number of MiB above 0, got {brief(memory)}; leave it out for none")
-        self.theory = _checked(theory).resolve(trace)
+        check_limit("limit (--time-limit)", "seconds", limit)
+        check_limit("memory (--memory-limit)", "MiB", memory)
+        if on_progress is not None and not callable(on_progress):
+            raise SolverError(f"on_progress: expected a function of one Progress, got {brief(on_progress)}")
+        self.theory = checked_theory(theory).resolve(trace)
         check_rules(self.theory)
         self.trace = trace
         self._begun = False
         self._basis: Basis | None = None  # of the certificate of the whole trace, where the search was stopped
         self._most = maps
         self._goes_on = after is not None
-        self._asked_speedups = speedups
+        self._asked_speedups = checked_speedups(speedups)
         self._on_progress = on_progress
         self._watch = Watch(limit, memory, self._report)
         self._task = Task.of(trace, self.theory, self._watch, speedups)
@@ -384,6 +373,9 @@ class Search:
     def solution(self, maps: tuple[SSHMap, ...] = ()) -> Solution:
         """How the search ended, with the maps that the caller kept."""
         asker = self._prefixes.engine.asker
+        # Perhaps the search ended while the prefix was given to clingo: then what shows the bound is sought in all steps.
+        ran_out = self.stopped not in (None, "maps limit")
+        basis = self._basis or self._basis_of(len(self.trace) if ran_out else self.prefix)
         return Solution(
             status=self.status,
             maps=maps,
@@ -393,7 +385,7 @@ class Search:
             theory=self.theory,
             steps=len(self.trace),
             prefix=self.prefix,
-            basis=self._basis_of(self.prefix) if self._basis is None else self._basis,
+            basis=basis,
             seconds=Seconds(self._watch.elapsed(), asker.ground_seconds, asker.solve_seconds),
             stopped=self.stopped,
             partial=None if self.best else self._known.partial,

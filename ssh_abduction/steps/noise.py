@@ -1,9 +1,9 @@
-"""The step at which a trace looks like noise: because of it alone, nearly all steps before it are dstates of their own.
+"""The step at which a trace looks like noise: because of it alone, most steps before it are dstates of their own.
 
 A robot that goes round in circles learns no new dstate, as each circuit shows what the ones before did. After one wrong view, or one step left out of the log,
 each step of all circuits before is told apart from all others by how far it is from there. So the map has as many dstates as the trace has steps, and the axioms
 allow no smaller one. That can be seen without a map: a largest clique of steps that are apart (apart.py) was small before that step, and with it is nearly all
-steps. Where a robot explores, the clique grows with each new dstate, little by little.
+steps, or two thirds of them where the same is seen in several places of a circuit and other things are done there. Where a robot explores, the clique grows with each new dstate, little by little.
 
 >>> from ssh_abduction.steps.noise import noise_in
 >>> circuits = [0, 1, 2, 3] * 8
@@ -21,8 +21,8 @@ from ssh_abduction.trace import Trace
 
 # No step looks like noise among the first so many steps, nor in a trace that is no longer: a robot that has just begun may well be somewhere new at each step.
 LEAST = 20
-# A step looks like noise only if because of it at least this share of the steps up to there have to be dstates of their own (nearly all of them).
-NEARLY_ALL = 0.8
+# A step looks like noise only if because of it at least this share of the steps up to there have to be dstates of their own.
+MOST = 0.5
 # And only if at most this share of those dstates is needed for the steps before it, and for the whole trace without it: one step that makes twice as many dstates
 # necessary stands out from a robot that explores, where each step adds one at most.
 FALL = 0.5
@@ -70,7 +70,7 @@ def noise_in(views: Sequence[int], actions: Sequence[int]) -> Noise | None:
     if long <= LEAST:
         return None
     before, up_to_there = len(_clique(views, actions, short)), len(_clique(views, actions, long))
-    if up_to_there < NEARLY_ALL * long or not 1 < before <= FALL * up_to_there:
+    if up_to_there < MOST * long or not 1 < before <= FALL * up_to_there:
         return None
     without = len(_clique(views, _cut_off(actions, short), len(views)))
     return Noise(short, up_to_there, without) if without <= FALL * up_to_there else None

@@ -11,11 +11,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from ssh_abduction.errors import TheoryError, brief
+from ssh_abduction.files import read_at_most
 from ssh_abduction.theory.encodings import Axiom, axioms_in
+
+LARGEST = 2**24  # bytes of a file of rules, at most
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Rules:
         if not isinstance(value, str | os.PathLike) or not str(value):
             raise TheoryError(f"rules: expected files of rules, got {brief(value)}; give their paths, as in rules=['own.lp']")
         try:
-            return cls(str(value), Path(value).read_bytes().decode("utf-8"))
+            return cls(str(value), read_at_most(value, LARGEST).decode("utf-8"))
         except (OSError, ValueError) as error:
             reason = "no text in UTF-8" if isinstance(error, UnicodeError) else getattr(error, "strerror", None) or error
             raise TheoryError(f"rules: {brief(str(value))} cannot be read: {reason}; check the path (--rules)") from None

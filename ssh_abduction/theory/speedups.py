@@ -29,19 +29,14 @@ class Speedups:
 
     prefixes: bool = True
     path_names: bool = True
-    from_below: bool = True
     names: bool = True
     clique: bool = True
-    apart: bool = True
     lazy: bool = True
     core_guided: bool = True
-    small_cores: bool = True
     sides: bool = True
     annealed: bool = True
     framing: bool = True
     ways: bool = True
-    watched: bool = True
-    one_by_one: bool = True
     threads: bool = True
     processes: bool = True
     greedy: bool = True
@@ -54,6 +49,8 @@ class Speedups:
     @classmethod
     def without(cls, names: str | Iterable[str]) -> Speedups:
         """All speed-ups but these. Raises SolverError."""
+        if not isinstance(names, Iterable):
+            raise SolverError(f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(names)}")
         off = [name for name in (names.split(",") if isinstance(names, str) else names) if name]
         for name in off:
             if name not in SPEEDUPS:
@@ -64,6 +61,13 @@ class Speedups:
         """Those of these speed-ups that hold for a theory, whose star is settled, by the table."""
         valid = {speedup.switch for speedup in TABLE if speedup.holds_for(theory)}
         return replace(self, **{name: False for name in SPEEDUPS if name not in valid})
+
+
+def checked_speedups(value: object) -> Speedups:
+    """The speed-ups that a caller gives. Raises SolverError."""
+    if not isinstance(value, Speedups):
+        raise SolverError(f"speedups: expected Speedups, got {brief(value)}; take Speedups() or Speedups.without(…)")
+    return value
 
 
 SPEEDUPS = tuple(f.name for f in fields(Speedups))
@@ -179,14 +183,6 @@ TABLE = (
         ONE_OF_EACH,
         lambda: SURVIVE_A_CUT,
     ),
-    Speedup(
-        "from_below",
-        "from_below",
-        "Ask a longer prefix first for a map that costs what was proved for a shorter one.",
-        _keeps_headings,
-        ONE_OF_EACH,
-        lambda: SURVIVE_A_CUT,
-    ),
     Speedup("path_names", "path_names", "Begin with few names for paths.", _has_paths, TRAVELS_AND_TURNS, EVERY),
     Speedup(
         "named dstates",
@@ -220,24 +216,11 @@ TABLE = (
         CAUSAL,
         EVERY,
     ),
-    Speedup("apart", "apart", "With names: say which steps are apart, where more than one action shows it.", _any_theory, CAUSAL, EVERY),
     Speedup(
         "sides", "sides", "With frames: say what order and sides forbid while dstates are sought, path by path.", _has_frames, FRAMES, EVERY
     ),
     Speedup("lazy", "lazy", "Give clingo only the links, or the visits, without which others go wrong.", _any_theory, NOTHING, EVERY),
     Speedup("core_guided", "core_guided", "Raise the bound from below, rather than better the map.", _any_theory, NOTHING, EVERY),
-    Speedup("small_cores", "small_cores", "With frames: make cores smaller, as long as that is cheap.", _any_theory, NOTHING, EVERY),
-    Speedup(
-        "one_by_one",
-        "one_by_one",
-        "With names: where raising the bound stalls, ask for numbers of dstates one by one.",
-        _any_theory,
-        NOTHING,
-        EVERY,
-    ),
-    Speedup(
-        "watched", "watched", "Make constraints of three literals longer, so that clasp watches two of them.", _any_theory, NOTHING, EVERY
-    ),
     Speedup("threads", "threads", "Two threads, where a trace is hard and there are two processors.", _any_theory, NOTHING, EVERY),
     Speedup(
         "processes",

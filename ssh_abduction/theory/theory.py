@@ -302,3 +302,10 @@ PRESETS: dict[str, Callable[[], Theory]] = {
     "topological": Theory.topological,
     "circumscriptive": Theory.circumscriptive,
 }
+
+
+def checked_theory(value: object) -> Theory:
+    """The theory that a caller gives, or Theory.topological() where that is None. Raises TheoryError."""
+    if not isinstance(value, Theory | None):
+        raise TheoryError(f"theory: expected a Theory, got {brief(value)}; take Theory.topological(), Theory.causal() or Theory(…)")
+    return value or Theory.topological()

@@ -1,0 +1,206 @@
+"""Which speed-ups earn their lines: each is switched off by itself, on several families of instances and seeds, with and without in turns.
+
+    python benchmarks/pruning.py [--only SWITCHES] [--seeds N] [--resume] [--out RESULTS.json] [--page PAGE.md]
+
+A speed-up stays if on two families the median over the seeds is at least GAIN times as many seconds without it, or as many dstates where a
+limit ends the search. Seconds are those that the processors worked, unless TRIALS says otherwise: so other work on the machine
+counts little. A search that its limit ends counts as if it had ended then, so the true ratio is at least as far from 1. `following` is no switch: cell.py
+says what is left out. Each run is a process of its own, and one runs at a time. What came of it is stored as JSON, run by run; --resume goes on with that.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import math
+import statistics
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bench import machine, packages, run, store
+from suite import BARE, INSTANCES
+from table import OURS, WITHOUT
+
+ROOT = Path(__file__).parent.parent
+GAIN = 1.5  # times as many seconds, or dstates, without a speed-up that stays,
+FAMILIES = 2  # on so many families of instances
+LIMIT, LONGER, SHORT = (
+    8.0,
+    12.0,
+    3.0,
+)  # seconds that a search has; where little was expected of a speed-up; and where hardly anything is to be proved
+MEMORY = 4096  # MiB
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A speed-up that is switched off on a family of instances, which is one instance with several seeds.
+
+    measure  "seconds" until one minimal map is proven, or "dstates" of the best map at the limit
+    clock    as in cell.py
+    """
+
+    switch: str
+    family: str
+    measure: str = "seconds"
+    limit: float = LIMIT
+    clock: str = "cpu"
+
+
+MAZE, CORRIDORS, MACHINE, MACHINE_16 = "maze 4x4 n=1600", "maze 5x5 n=1600, corridors followed", "moore 20/2 n=800", "moore 16/2 n=1600"
+BLOCK, SMALL_BLOCK, LARGE_BLOCK = "circuits 60x40, 4 rounds", "full circuits 5x3, 50 rounds", "full circuits 6x4, 20 rounds"
+STARS, STAR_CORRIDORS, FEW_SEEN, TAYLOR = (
+    "full maze 4x4 n=800",
+    "full maze 5x5 n=600, corridors followed",
+    "full maze 8x8 n=150",
+    "full taylor-hall",
+)
+BARE_CORRIDORS, PATTERNS = "full maze 4x4 n=40, corridors followed, no stars", "full maze 3x3 n=60, stars as patterns"
+LONG = ("maze 4x4 n=10000", "maze 5x5 n=10000, corridors followed", "moore 16/2 n=10000")
+
+
+def _timed(switch: str, *families: str, limit: float = LIMIT, clock: str = "cpu") -> list[Trial]:
+    return [Trial(switch, family, limit=limit, clock=clock) for family in families]
+
+
+def _ended(switch: str, *families: str, limit: float = LIMIT, clock: str = "cpu") -> list[Trial]:
+    return [Trial(switch, family, "dstates", limit, clock) for family in families]
+
+
+TRIALS = (
+    *_timed("small_cores", STARS, STAR_CORRIDORS, FEW_SEEN, "full maze 10x10 n=200", limit=LONGER),
+    *_timed("one_by_one", MAZE, CORRIDORS, MACHINE, BARE.name, *LONG[:2], limit=LONGER),
+    *_timed("from_below", SMALL_BLOCK, LARGE_BLOCK, PATTERNS, BARE_CORRIDORS, limit=LONGER),
+    *_timed("watched", MAZE, CORRIDORS, MACHINE, STAR_CORRIDORS, *LONG, limit=LONGER),
+    *_timed("apart", MAZE, CORRIDORS, MACHINE, BLOCK, MACHINE_16, LONG[0], BARE.name, limit=LONGER),
+    *_timed("following", *LONG, limit=LONGER),
+    *_ended("following", "maze 6x6 n=10000", "maze 7x7 n=10000, corridors followed", "maze 8x8 n=10000", limit=LONGER),
+    *_timed("names", MAZE, MACHINE_16, STARS),
+    *_timed("clique", MAZE, MACHINE, STAR_CORRIDORS, BARE.name),
+    *_timed("lazy", MAZE, MACHINE, STAR_CORRIDORS, LONG[2]),
+    *_timed("core_guided", MAZE, MACHINE, STARS),
+    *_timed("sides", STARS, STAR_CORRIDORS, FEW_SEEN),
+    *_timed("ways", BARE_CORRIDORS, BARE.name, LARGE_BLOCK),
+    *_timed("prefixes", SMALL_BLOCK, BLOCK, TAYLOR),
+    *_timed("path_names", SMALL_BLOCK, BARE_CORRIDORS, PATTERNS),
+    *_timed("framing", BARE.name),
+    *_ended("framing", "full maze 4x4 n=800, no stars", "full maze 5x5 n=1600, no stars"),
+    *_timed("annealed", MAZE, STAR_CORRIDORS),
+    *_ended("annealed", "maze 6x6 n=1600", "full maze 10x10 n=400"),
+    *_timed("greedy", MAZE),
+    *_ended("greedy", "maze 6x6 n=10000", "full maze 10x10 n=4000", "full maze 5x5 n=1600, no stars", limit=SHORT),
+    *_timed("threads", MAZE, STAR_CORRIDORS, MACHINE, clock="wall"),
+    *_timed("processes", STARS, STAR_CORRIDORS, FEW_SEEN, clock="wall"),
+    *_ended("processes", "full maze 10x10 n=400", limit=LIMIT, clock="wall"),
+)
+SWITCHES = tuple(dict.fromkeys(trial.switch for trial in TRIALS))
+
+
+def ratio(measure: str, limit: float, base: dict[str, Any], without: dict[str, Any]) -> float:
+    """What is needed without a speed-up, as a ratio to with it."""
+    if measure == "dstates":
+        here, there = (cell.get("dstates") or math.inf for cell in (base, without))
+        return 1.0 if here == there else there / here
+    here, there = (min(cell["seconds"], limit) if cell["status"] == "ok" else limit for cell in (base, without))
+    return there / here
+
+
+def ratios(results: dict[str, Any]) -> dict[str, dict[Trial, list[float]]]:
+    """The ratios of each trial, one a seed, by switch."""
+    pairs: dict[tuple[Trial, int], dict[bool, dict[str, Any]]] = {}
+    for cell in results["cells"]:
+        trial = Trial(cell["switch"], cell["instance"], cell["measure"], cell["limit"], cell["clock"])
+        pairs.setdefault((trial, cell["seed"]), {})[cell["tool"] == OURS] = cell
+    found: dict[str, dict[Trial, list[float]]] = {}
+    for (trial, _), pair in pairs.items():
+        if len(pair) == 2:
+            found.setdefault(trial.switch, {}).setdefault(trial, []).append(ratio(trial.measure, trial.limit, pair[True], pair[False]))
+    return found
+
+
+def stays(of_switch: Iterable[list[float]]) -> bool:
+    """Whether the ratios of a switch, a list for each family, show that it earns its lines."""
+    return sum(statistics.median(of_family) >= GAIN for of_family in of_switch) >= FAMILIES
+
+
+def table(results: dict[str, Any]) -> str:
+    """Markdown: a row for each switch."""
+    rows = ["| speed-up | without it, as a ratio to with it: the median over the seeds (least to most) | verdict |", "| -- | -- | -- |"]
+    for switch, trials in ratios(results).items():
+        cells = [f"{trial.family}{_meant(trial)}: {_spread(found)}" for trial, found in trials.items()]
+        rows.append(f"| {switch} | {'<br>'.join(cells)} | {'stays' if stays(trials.values()) else '**goes**'} |")
+    return "\n".join(rows)
+
+
+def _meant(trial: Trial) -> str:
+    """What is compared, where that is not CPU seconds."""
+    return f", dstates after {trial.limit:g} s" if trial.measure == "dstates" else ", wall-clock" if trial.clock == "wall" else ""
+
+
+def _spread(found: list[float]) -> str:
+    shown = [f"{number:.2f}" if number < math.inf else "∞" for number in (statistics.median(found), min(found), max(found))]
+    return f"**{shown[0]}** ({shown[1]} to {shown[2]})" if statistics.median(found) >= GAIN else f"{shown[0]} ({shown[1]} to {shown[2]})"
+
+
+def page(results: dict[str, Any], stored: Path) -> str:
+    """What docs/pruning.md says."""
+    on, versions = results["machine"], ", ".join(f"{package} {number}" for package, number in results["packages"].items())
+    return f"""# Which speed-ups earn their lines
+
+Each speed-up was switched off by itself on three families of instances or more, {results["seeds"]} seeds each, with and without in turns: CPU seconds until one minimal map
+is proven, {LIMIT:g} or {LONGER:g} s at most, or the dstates of the best map where a limit ended both; a speed-up stays where two families show {GAIN} times. Measured on {results["date"]} by
+`benchmarks/pruning.py` on {on["cpu"]}, {on["cores"]} cores, Python {on["python"]}, {versions}, while other work ran there.
+
+A search that its limit ended counts as if it had ended then. ∞ stands for no map at all. The names of families are explained in `benchmarks/suite.py`: "full" is the topological
+theory, with stars where nothing else is said; other families are of the causal theory. `threads` and `processes` are about a second processor, so they are measured by
+the clock on the wall, which other work disturbs.
+
+{table(results)}
+
+From [`{stored.relative_to(ROOT).as_posix()}`](../{stored.relative_to(ROOT).as_posix()}).
+"""
+
+
+def measure(results: dict[str, Any], trials: Iterable[Trial], seeds: int, out: Path) -> None:
+    """Run what is not stored yet."""
+    done = {(c["switch"], c["instance"], c["measure"], c["limit"], c["seed"], c["tool"]) for c in results["cells"]}
+    for trial in trials:
+        for seed in range(seeds):
+            tools = [OURS, f"{OURS}{WITHOUT}{trial.switch}"]
+            for tool in tools if seed % 2 else tools[::-1]:
+                if (trial.switch, trial.family, trial.measure, trial.limit, seed, tool) not in done:
+                    cell = run(tool, INSTANCES[trial.family], seed, trial.limit, MEMORY, trial.clock)
+                    results["cells"].append(
+                        {**cell, "switch": trial.switch, "measure": trial.measure, "limit": trial.limit, "clock": trial.clock}
+                    )
+                    store(results, out)
+                    came = f"{cell['status']:8} {cell.get('seconds', 0):6.2f} s {cell.get('dstates')} dstates"
+                    print(f"{trial.family:50} {seed} {tool:34} {came}", file=sys.stderr, flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", default=",".join(SWITCHES), metavar="SWITCHES", help="speed-ups, commas between (default all)")
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="traces of each family (default 5)")
+    parser.add_argument("--resume", action="store_true", help="keep what is stored, and run only what is not")
+    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "pruning.json", metavar="RESULTS.json")
+    parser.add_argument("--page", type=Path, metavar="PAGE.md", help="write the page with the table there")
+    options = parser.parse_args()
+    results: dict[str, Any] = {"date": datetime.date.today().isoformat(), "limit": LIMIT, "memory": MEMORY, "seeds": options.seeds}
+    results |= {"machine": machine(), "packages": {k: v for k, v in packages().items() if k in (OURS, "clingo")}, "cells": []}
+    out = options.out.resolve()
+    if options.resume and out.exists():
+        results["cells"] = json.loads(out.read_text(encoding="utf-8"))["cells"]
+    only = options.only.split(",")
+    measure(results, [trial for trial in TRIALS if trial.switch in only], options.seeds, out)
+    print(table(results))
+    if options.page:
+        options.page.write_text(page(results, out), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
