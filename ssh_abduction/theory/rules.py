@@ -17,7 +17,8 @@ from ssh_abduction.errors import TheoryError, brief
 from ssh_abduction.files import read_at_most
 from ssh_abduction.theory.encodings import Axiom, axioms_in
 
-LARGEST = 2**24  # bytes of a file of rules, at most
+# Bytes that a file of rules may have: a device that never ends is refused before it fills the memory.
+LARGEST = 2**24
 
 
 @dataclass(frozen=True)
