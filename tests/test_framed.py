@@ -640,7 +640,7 @@ def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[
         return
     assert chart.is_map(labels)
     assert not any(apart[i, j] for i in range(len(labels)) for j in range(i) if labels[i] == labels[j])
-    singles = asked._paths.has_single(chart, labels)
+    singles = asked._paths.has_separate(chart, labels)
     if singles or not told:
         with patch.object(framed, "MANY_DSTATES", 100):
             assert (asked._some_paths(labels) is not None) >= singles
@@ -681,7 +681,7 @@ def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, s
         labels = known.labels_near(chart, apart, guess)
         assert labels
         assert chart.is_map(labels)
-        assert known.has_single(chart, labels)
+        assert known.has_separate(chart, labels)
         assert len(set(labels)) <= len(set(truth))
 
 
@@ -748,7 +748,7 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, mo
     with patch.object(annealing, "ANNEALED", ((0.5, 100),)), patch.object(streets, "attempts", counted):
         labels = asked._paths.guessed_labels(chart, Watch())
     assert failed[0] > 0
-    assert asked._paths.has_single(chart, labels)
+    assert asked._paths.has_separate(chart, labels)
     assert len(set(labels)) < most * len(set(walk.truth))
 
 

@@ -17,13 +17,16 @@ from instances import maze
 from strategies import TOYS, Toy, traces
 from worlds import ACTIONS
 
-from ssh_abduction import OnlineMapper, Speedups, SSHMap, Status, Theory, TheoryError, Trace, solve
+from ssh_abduction import OnlineMapper, Search, Speedups, SSHMap, Status, Theory, TheoryError, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.engines.causal import CausalEngine
+from ssh_abduction.engines.framed import FramedEngine
+from ssh_abduction.engines.frameless import FramelessEngine
 from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.explain import explain
 from ssh_abduction.judge import check
 from ssh_abduction.judge.checker import unchecked
+from ssh_abduction.online import mapper as mapper_module
 from ssh_abduction.solver import judging, prefixes, search
 from ssh_abduction.solver.judging import InternalError
 from ssh_abduction.theory import encodings
@@ -218,6 +221,39 @@ def test_what_evidence_refuses_of_a_map_is_forbidden(name: str, data: st.DataObj
     assert {key(ssh_map) for ssh_map in solution.maps} == expected
 
 
+FAST = {
+    "causal": (Theory.causal(), CausalEngine),
+    "framed": (Theory(star="frame", path_order="total", boundary="none"), FramedEngine),
+    "frameless": (Theory(star="none"), FramelessEngine),
+}
+
+
+@pytest.mark.parametrize("name", FAST)
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(data=st.data())
+def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.DataObject) -> None:
+    """An engine that settles dstates first is told of it, too, and its maps are those of the brute force."""
+    theory, kind = FAST[name]
+    trace = data.draw(traces(max_steps=6), label="trace")
+    if theory.star == "frame" and not trace.has_stars:
+        return
+
+    def allows(found: Key) -> bool:
+        return all(found[0].count(label) <= 2 for label in found[0])
+
+    counts, expected = minimal_maps(trace, theory.resolve(trace), allows)
+    with (
+        patch.object(judging, "evidence_of", lambda _: (NoLongReturns(),)),
+        patch.object(prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 8]), label="first prefix")),
+        patch.multiple(search, FEW_STEPS=0, FRAME_AFTER=-1.0),
+    ):
+        asked = Search(trace, theory, maps=0, speedups=Speedups.without("framing"))
+        found = tuple(asked)
+    assert isinstance(asked._prefixes.engine, kind) or name == "frameless"
+    assert asked.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
+    assert {key(ssh_map) for ssh_map in found} == expected
+
+
 def test_steps_said_to_be_at_one_place_that_cannot_be() -> None:
     trace = Trace.load(EXAMPLES / "aces3-route.jsonl")
     at_check = Rules("one.lp", "#program check(t).\n:- query(t), not same_place(5,15).")
@@ -330,6 +366,27 @@ def test_a_map_that_breaks_an_axiom_is_an_internal_error() -> None:
         pytest.raises(InternalError, match=rf"internal error: a map .* \(trace {trace.digest}\)"),
     ):
         solve(trace, Theory.causal())
+
+
+def follow(mapper: OnlineMapper, views: str) -> None:
+    for view in views:
+        mapper.observe("travel", view)
+
+
+def test_a_replayed_map_that_breaks_an_axiom_is_an_internal_error_while_a_robot_drives() -> None:
+    """Replays are checked, too, as long as that takes a tenth of the time at most."""
+    mapper = OnlineMapper("a", Theory.causal(), limit=None)
+    right = mapper_module._Replayed.map
+
+    def wrong(self: mapper_module._Replayed) -> SSHMap:
+        found = right(self)
+        return replace(found, labels=(0,) * len(found.labels))
+
+    with (
+        patch.object(mapper_module._Replayed, "map", wrong),
+        pytest.raises(InternalError, match="internal error: a map that was found breaks"),
+    ):
+        follow(mapper, "bababa")
 
 
 def test_what_is_asserted_is_told_to_the_engine_with_names() -> None:

@@ -15,8 +15,10 @@ from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
-FIRST_PREFIXES = 32  # An engine with a chart tries a prefix of so many steps before one of AT_ONCE steps: most traces are settled by then.
-AT_ONCE = 8000  # So many steps, at most, are compared in pairs: the matrix of the pairs has the square of that many bytes.
+# An engine with a chart tries a prefix of so many steps before one of AT_ONCE steps: most traces are settled by then.
+FIRST_PREFIXES = 32
+# So many steps, at most, are compared in pairs: the matrix of the pairs has the square of that many bytes.
+AT_ONCE = 8000
 
 
 @dataclass(frozen=True, slots=True)

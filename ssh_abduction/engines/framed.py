@@ -1,24 +1,24 @@
-"""An engine for the full theory where places have frames and fewest dstates come first: dstates first, then places and paths.
+"""An engine for the topological theory where places have frames and fewest dstates come first: dstates first, then places and paths.
 
 Frames tell so much that the dstates are all but settled before any place or path is: a turn rotates by known quarters, so whole visits are
 the same or not (`steps/chart.py`). Which ones are is asked of visits.lp (`engines/visits.py`), which knows the causal axioms and how turns
 rotate, but not the order of places on a path, or its sides. For what that leaves of the dstates, paths_framed.lp finds the fewest paths and
 places.
 
-*Claim.* Cut to which visits are at one place, a map of the full theory is an answer of visits.lp. So the fewest dstates of the latter are
-a lower bound, and if some answer of that cost has streets, all minimal maps are among the answers of that cost with their least streets.
-*If none has*, paths_framed.lp is asked which street shows it, and sides_framed.lp says for that street what order and sides demand of the visits
-that are one. If no single street does, or visits are too many for that, paths_framed.lp is asked which labels clash: smallest sets of nodes at
-dstates that no streets fit; visits.lp is told that these do not go together. As every map of the full theory keeps that, bounds still hold.
+*Claim.* Cut to which visits are at one place, a map of the topological theory is an answer of visits.lp. So the fewest dstates of the latter are
+a lower bound, and if some answer of that cost has paths, all minimal maps are among the answers of that cost with their least paths.
+*If none has*, paths_framed.lp is asked which path shows it, and sides_framed.lp says for that path what order and sides demand of the visits
+that are one. If no single path does, or visits are too many for that, paths_framed.lp is asked which labels clash: smallest sets of nodes at
+dstates that no paths fit; visits.lp is told that these do not go together. As every map of the topological theory keeps that, bounds still hold.
 
-*Beside.* What takes long is guessed in another process, and the guess made a map (`engines/streets.py`). Near it, maps are made here, while
+*Beside.* What takes long is guessed in another process, and the guess made a map (`engines/paths.py`). Near it, maps are made here, while
 there it is proven with names, from the guess outwards, how many dstates the causal axioms need (`engines/nearby.py`). Where a map has so
 few, it has the fewest; and the same names then list all ways to be at so few. Some of them fit no frame, which paths_framed.lp sees, or have no
-streets; but each map of the full theory is among them.
+paths; but each map of the topological theory is among them.
 
-*Which street.* In a world half explored the causal axioms allow fewer dstates than order and sides do, in thousands of ways: to forbid
-these one by one does not end. What sides_framed.lp says of a single street takes a rule for each two visits that may be one, so it is said only of
-streets that an answer contradicts.
+*Which path.* In a world half explored the causal axioms allow fewer dstates than order and sides do, in thousands of ways: to forbid
+these one by one does not end. What sides_framed.lp says of a single path takes a rule for each two visits that may be one, so it is said only of
+paths that an answer contradicts.
 
 *Listing.* Most of the time of a long list would go into reading answers. So an answer is asked for the atoms that it may hold, those of the
 last answer first, and clingo searches for the next one while a map is made of it.
@@ -47,25 +47,39 @@ from ssh_abduction.guesses.merging import kept
 from ssh_abduction.steps.chart import Chart, FramedChart, numbered
 from ssh_abduction.theory.evidence import Equality
 
-CLASHES = 30  # that clingo is told of in one go
-MANY_DSTATES = 50  # above which it is asked for single streets first
-ALL_PATHS = 0.1  # times as long as single ones, about, for each dstate, all take to ground
-PREPARED = 3.5  # times as long, until clasp has prepared to solve and can be stopped
-MANY_PAIRS = 20_000  # visits that may be one, above which a street is too much to say: some forty rules for each of them
-KEPT = 10  # controls of minimal namings that are kept until their maps are listed: each is some megabytes
-SOON = 3.0  # seconds without the fewest dstates after which a map near a guess is sought beside,
-SOON_SHARE = 0.05  # or so much of a longer time limit, if that is less
-GUESS_FIRST = 5.0  # the same, where that has to be done first
-LATER = 4  # times as long, where clingo was not told of all visits,
-LATER_SHARE = 0.25  # or so much of the time limit, if that is less
-GUESSES = 20  # labels that are tried, near what annealing guesses
-GUESSING = 1000  # conflicts after which better streets of these are no longer sought
-BETTERING = 20_000  # conflicts after which better streets are no longer sought one after another
+# Clingo is told of so many clashes in one go: each spares a question, and one control of paths lists them all.
+CLASHES = 30
+# Labels with more dstates than this are tried with separate paths first, as to ground all ways to merge paths takes long.
+MANY_DSTATES = 50
+# All ways to merge paths take so many times as long to ground as separate paths, about, for each dstate.
+ALL_PATHS = 0.1
+# So many times as long as grounding took it is until clasp has prepared to solve, and can be stopped.
+PREPARED = 3.5
+# With more pairs of visits that may be one, nothing is said of single paths: that takes some forty rules for each pair.
+MANY_PAIRS = 20_000
+# So many controls of minimal labels are kept until their maps are listed: each is some megabytes, and is made again in seconds.
+KEPT = 10
+# After so many seconds without the fewest dstates a map near a guess is sought beside: most traces are solved by then.
+SOON = 3.0
+# Or after such a share of the time limit, if that is less, so that the guess has time to be of use.
+SOON_SHARE = 0.05
+# Without a second processor a map near a guess is sought after so many seconds, as clingo waits meanwhile.
+GUESS_FIRST = 5.0
+# That is after so many times as long where clingo was not told of all visits: it is soon told of more.
+LATER = 4
+# Or after such a share of the time limit, if that is less.
+LATER_SHARE = 0.25
+# So many labels near a guess are tried, at most, until some have paths.
+GUESSES = 20
+# After so many conflicts better paths for a map near a guess are no longer sought: fewer dstates matter more.
+GUESSING = 1000
+# After so many conflicts better paths are no longer sought one after another; the bound is raised from below instead.
+BETTERING = 20_000
 
 
 @dataclass(frozen=True)
 class _Naming:
-    """The dstate of each node, and a control for its streets, unless one is to be taken anew."""
+    """The dstate of each node, and a control for its paths, unless one is to be taken anew."""
 
     labels: list[int]
     control: clingo.Control | None
@@ -294,7 +308,7 @@ class FramedEngine:
             yield from (found for found in self._maps(_Naming(list(known), None), "opt", GUESSING) if found.cost < cost)
 
     def _maps_found_beside(self) -> Iterator[Found]:
-        """A map of the labels last found beside, if they are new and have streets."""
+        """A map of the labels last found beside, if they are new and have paths."""
         if labels := self._labels_beside():
             self._tried = labels
             yield from self._known_if_it_has_paths(labels)
@@ -307,7 +321,7 @@ class FramedEngine:
         return labels
 
     def _known_if_it_has_paths(self, labels: Sequence[int]) -> Generator[Found, None, bool | None]:
-        """The map of these labels, from now on the known one, if any streets fit them. Returns whether they do; None if there is no time to see that."""
+        """The map of these labels, from now on the known one, if any paths fit them. Returns whether they do; None if there is no time to see that."""
         fitted = self._paths_found_soon(labels)
         if fitted is None:
             if not self.asker.watch.allows(self._preparing):
@@ -351,7 +365,7 @@ class FramedEngine:
         return self._paths_found_soon(labels) or self._any_paths(labels)
 
     def _paths_found_soon(self, labels: Sequence[int]) -> _Fitted | None:
-        """A map with these dstates, where they are many and there is one in which no two places or stretches are taken for one."""
+        """A map with these dstates, where they are many and there is one in which no two places or segments are taken for one."""
         found = self._separate_paths(labels, self._chart) if len(set(labels)) > MANY_DSTATES else None
         return _Fitted(found, _Naming(list(labels), None)) if found else None
 
@@ -362,12 +376,12 @@ class FramedEngine:
         return _Fitted(found, naming) if found else None
 
     def _separate_paths(self, labels: Sequence[int], chart: FramedChart) -> Found | None:
-        """A map with these dstates in which no two places or stretches are taken for one, unless they have to be; if there is one."""
+        """A map with these dstates in which no two places or segments are taken for one, unless they have to be; if there is one."""
         naming = _Naming(list(labels), self._path_control(labels, single=True, chart=chart))
         return next(self._maps(naming, "ignore", chart=chart), None)
 
     def _better_paths(self, naming: _Naming) -> Iterator[Found]:
-        """Maps with these dstates, each as good as the one before or better, the last one best; none if no streets fit them.
+        """Maps with these dstates, each as good as the one before or better, the last one best; none if no paths fit them.
 
         Where bettering maps does not end soon, the bound is raised from below instead.
         """
@@ -390,7 +404,7 @@ class FramedEngine:
 
     @property
     def _preparing(self) -> float:
-        """Seconds, about, until clingo can be stopped that is asked for all streets."""
+        """Seconds, about, until clingo can be stopped that is asked for all paths."""
         return PREPARED * self._path_seconds
 
     def _path_control(

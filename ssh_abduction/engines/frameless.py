@@ -1,11 +1,11 @@
-"""An engine for the full theory where places have no frames and fewest dstates come first: dstates first, then places and paths.
+"""An engine for the topological theory where places have no frames and fewest dstates come first: dstates first, then places and paths.
 
 The axioms of places and paths for each step of a trace are too much for clingo after some dozen steps that keep exploring. But they speak
 of dstates: of which place one is at, and which path it is along. So the dstates have names, as in the causal theory (`engines/naming.py`),
 and sides_frameless.lp says what order and sides demand of where the actions at them lead. That depends on how many dstates there are, not on how many
 steps.
 
-*Claim.* Each map of the full theory is an answer of names.lp and sides_frameless.lp, at the cost that it has in the causal theory.
+*Claim.* Each map of the topological theory is an answer of names.lp and sides_frameless.lp, at the cost that it has in the causal theory.
 *Proof.* Let `goes` hold of the links of the map, and of no others; let each atom of sides_frameless.lp hold where what its comment says is so in the map.
 Then its rules are what the axioms say of two or three dstates: a travel keeps the path, and leads on along it, as the order is transitive;
 a turn keeps the place. The rest (`engines/naming.py`) is no dstate of theirs. ∎
@@ -36,8 +36,10 @@ from ssh_abduction.steps.chart import Link, numbered
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 
-CONTRARY = 8  # Clingo is told of so many paths in one go: of fewer it would be asked more often, and most of more would not be needed.
-BETTERING = 20_000  # After so many conflicts better courses are no longer sought one after another; the bound is raised from below instead.
+# Clingo is told of so many paths in one go: of fewer it would be asked more often, and most of more would not be needed.
+CONTRARY = 8
+# After so many conflicts better paths are no longer sought one after another; the bound is raised from below instead.
+BETTERING = 20_000
 
 _Far: TypeAlias = tuple[int, int, int, int]  # two dstates that are not at one place, and two steps at them of which evidence says so
 _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...]]  # labels of all steps, and options of clasp

@@ -24,7 +24,7 @@ from ssh_abduction.trace import Trace
 
 
 def maps_with_frames(trace: Trace, theory: Theory, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
-    """Maps of a trace, each with fewer dstates than the one before, or as many and better streets, and the last one the best in which places have frames.
+    """Maps of a trace, each with fewer dstates than the one before, or as many and better paths, and the last one the best in which places have frames.
 
     theory  what it asks for, with star settled; none where it has no theory with frames
     """

@@ -44,14 +44,22 @@ from ssh_abduction.steps.apart import Matrix
 from ssh_abduction.steps.chart import Chart, numbered
 from ssh_abduction.theory.speedups import Speedups
 
-CONFLICTS = 2000  # after which a question is left open, at first; then twice as many
-WIDE = 10  # as many times as many, where nothing is assumed of steps
-REGIONS = 40  # parts of the map that are drawn anew in vain, before anything else is tried
-FIRST_REGION = 10  # dstates of such a part, at first and at least
-LARGER, SMALLER = 2, 4  # dstates that it gets more where it cannot have fewer, and less where that was left open
-PREPARING = 1.0  # times as long as grounding took, about, clingo prepares to solve, and cannot be stopped
-AT_A_TIME = 100  # links that clingo is given in one go
-SECONDS_A_CHARACTER = 1e-6  # that clingo takes, at most about, to read and ground where names lead: it cannot be stopped meanwhile
+# After so many conflicts a question is left open, at first; each round of questions has twice as many as the one before.
+CONFLICTS = 2000
+# A question that assumes nothing of where steps are may take so many times as many conflicts, as it decides more.
+WIDE = 10
+# So many parts of the map are drawn anew in vain before anything else is tried.
+REGIONS = 40
+# Such a part has so many dstates at first, and at least.
+FIRST_REGION = 10
+# It gets so many dstates more where it is shown not to need fewer, and so many less where that was left open.
+LARGER, SMALLER = 2, 4
+# So many times as long as grounding took clingo prepares to solve, about, and cannot be stopped.
+PREPARING = 1.0
+# Clingo is given so many links in one go, as it cannot be stopped meanwhile.
+AT_A_TIME = 100
+# Clingo takes so many seconds a character, at most about, to read and ground where names lead. It cannot be stopped meanwhile.
+SECONDS_A_CHARACTER = 1e-6
 
 Labels: TypeAlias = list[int]
 _Key: TypeAlias = tuple[int, int]  # what is seen at a node, and its label

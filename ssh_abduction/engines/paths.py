@@ -5,17 +5,17 @@ hardly any: so little time that some conflicts are limit enough.
 
 *A guess.* Visits are annealed (`guesses/annealing.py`). Where the guess cannot be right its places are let free, and what is there is
 merged by evidence (`guesses/merging.py`), while paths_framed.lp says which visits cannot be one, and which have to be, and which merge leads to
-no streets: so a guess becomes a map.
+no paths: so a guess becomes a map.
 
-*Taken back.* Where what is known by then has no streets, the first merge that shows it is found by bisection, and the two classes that it
-made one are apart from then on. Where the guess itself has no streets, its places are taken in order, those visited once first and then
-those visited most; the first place with which there are no streets is left out of the guess, a few at most. Where a guess leads to no map,
+*Taken back.* Where what is known by then has no paths, the first merge that shows it is found by bisection, and the two classes that it
+made one are apart from then on. Where the guess itself has no paths, its places are taken in order, those visited once first and then
+those visited most; the first place with which there are no paths is left out of the guess, a few at most. Where a guess leads to no map,
 another one follows, with more spare names for places: places that fall together where names are short do not come apart later.
 
-*Single streets.* To see that dstates have streets at all, no two places that turns do not join, and no two stretches of a path, are taken
+*Separate paths.* To see that dstates have paths at all, no two places that turns do not join, and no two segments of a path, are taken
 for one unless they have to be. That takes a small part of the time that it takes to ground all ways to merge them.
 
-*Pinned.* For the fewest paths, stretches no two of which can be one path are paths of their own, and the other stretches choose among these
+*Pinned.* For the fewest paths, segments no two of which can be one path are paths of their own, and the other segments choose among these
 first.
 """
 
@@ -41,23 +41,26 @@ from ssh_abduction.steps.localising import faced, states_of, tracked
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
-# clasp's way to list answers in which no atom that is shown can be spared:
+# So clasp lists the answers in which no atom that is shown can be spared.
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
-FIRST_PAIRS = 200_000  # visits that may be one, of the beginning that is guessed first, where a trace has more than twice as many
-LOST = 0.05  # of all visits, at most, if the beginning says where they are
-TRYING = 500  # conflicts after which it is left open whether there are single streets
-LEFT_OUT = 3  # places, at most, without which a guess has streets
-PREPARING = (
-    1.6,
-    2.1,
-)  # of the time and of the memory that grounding all streets or courses took, clasp takes so much, about, before it can be stopped
-LOOSENED = 2  # so many travels, less one, from where a guess cannot be right its places are let free
+# Of a trace that has more than twice as many pairs of visits that may be one, the beginning with so many is guessed first: annealing takes time for each pair.
+FIRST_PAIRS = 200_000
+# A guess at the beginning says where the visits of the whole trace are if it leaves this share of them open at most. With more it is worth little.
+LOST = 0.05
+# After so many conflicts it is left open whether there are separate paths: the question is asked thousands of times, and mostly decided without a conflict.
+TRYING = 500
+# So many places, at most, are left out of a guess so that the others have paths. A guess that is wrong about more is better made anew.
+LEFT_OUT = 3
+# So many times the time, and the memory, that grounding places and paths took clasp takes before it can be stopped, about.
+PREPARING = (1.6, 2.1)
+# Where a guess cannot be right, the places less than so many travels away are let free, too, as a wrong place mostly has a wrong neighbour.
+LOOSENED = 2
 
 
 class Paths:
     """The axioms of places and paths, for charts of one trace.
 
-    pinned  whether stretches no two of which can be one path are named as paths beforehand
+    pinned  whether segments no two of which can be one path are named as paths beforehand
     check   called now and then while clingo grounds; may raise. A process that is sent these questions has its own, so this does not go along
     """
 
@@ -98,14 +101,14 @@ class Paths:
     def settled(
         self, chart: FramedChart, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None, *, single: bool
     ) -> clingo.Control:
-        """A control for the streets that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
+        """A control for the paths that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
         control = self.control(chart, options)
         control.load_encodings("preference")
         nodes = range(len(labels)) if nodes is None else nodes
         control.add("base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single))
         control.ground([("base", []), *([("again", [])] if single else []), ("least", [])])
         if self._pinned and not single:
-            control.add("pinned", [], facts.pinned_facts(_rivals(*facts.read_rivals(control))))
+            control.add("pinned", [], facts.pinned_facts(_pairwise_distinct(*facts.read_rivals(control))))
         control.ground([("pinned", []), ("paths", [])])
         return control
 
@@ -129,22 +132,22 @@ class Paths:
         return _apart(chart, labels, elsewhere), [(first[a], first[b]) for a, b in one]
 
     def may_fit(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
-        """Whether these labels, which hold of all nodes but some, may be those of a map, as far as single streets tell."""
+        """Whether these labels, which hold of all nodes but some, may be those of a map, as far as separate paths tell."""
         control = self.control(chart)
         control.add("base", [], facts.settled_labels(enumerate(labels)))
         control.ground([("base", [])])
-        return not facts.is_violated(control) and self._may_have_single(chart, labels, loose)
+        return not facts.is_violated(control) and self._may_have_separate(chart, labels, loose)
 
-    def has_single(self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None) -> bool | None:
-        """Whether the labels of all nodes, or of these, have streets, as far as single ones tell. None where that is not soon known."""
+    def has_separate(self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None) -> bool | None:
+        """Whether the labels of all nodes, or of these, have paths, as far as separate ones tell. None where that is not soon known."""
         options = [f"--solve-limit={TRYING}"]
         return self.settled(chart, labels, options, nodes, single=True).solve().satisfiable
 
-    def _may_have_single(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
-        return self.has_single(chart, labels, set(range(len(labels))).difference(loose)) is not False
+    def _may_have_separate(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
+        return self.has_separate(chart, labels, set(range(len(labels))).difference(loose)) is not False
 
     def guessed_labels(self, chart: FramedChart, watch: Watch) -> list[int]:
-        """Labels of a map of the causal axioms: one that has streets, as far as single ones tell, or where that is not soon found one of few dstates.
+        """Labels of a map of the causal axioms: one that has paths, as far as separate ones tell, or where that is not soon found one of few dstates.
 
         Of a long trace the beginning is guessed, and the rest as that says; where that is no map, twice as many visits, and so on.
         """
@@ -185,7 +188,7 @@ class Paths:
     def labels_near(
         self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None] = lambda: None
     ) -> list[int] | None:
-        """Labels near these, which are -1 where they are not known, of a map that has streets, as far as single ones tell; None if none is soon found.
+        """Labels near these, which are -1 where they are not known, of a map that has paths, as far as separate ones tell; None if none is soon found.
 
         apart  which nodes are apart, nodes x nodes
         check  called now and then; may raise
@@ -193,15 +196,15 @@ class Paths:
         tell = partial(self._told_if_separate, chart)
         likely = self._likely(chart, apart, start, check)
         labels = merged_as_told(apart, chart.links, likely, tell, partial(self.may_fit, chart), check) if likely else None
-        return labels if labels and self.has_single(chart, labels) else None
+        return labels if labels and self.has_separate(chart, labels) else None
 
     def _told_if_separate(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
-        """As `told`; None where the others have no streets either, as far as single ones tell."""
+        """As `told`; None where the others have no paths either, as far as separate ones tell."""
         told = self.told(chart, labels, loose)
-        return told if told and self._may_have_single(chart, labels, loose) else None
+        return told if told and self._may_have_separate(chart, labels, loose) else None
 
     def _likely(self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]) -> list[int] | None:
-        """A guess without those of its places with which it has no streets, if they are few: -1 there."""
+        """A guess without those of its places with which it has no paths, if they are few: -1 there."""
         states = states_of(chart, kept(apart, chart.links, start))
         visits = Counter(state // 4 for state in states)
         # What was visited once cannot be wrong by itself, and hardly what was visited often.
@@ -227,13 +230,13 @@ class Paths:
         return of_first(len(places))
 
 
-def _rivals(stretches: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
-    """As many stretches as are soon found no two of which can be one path, as these pairs cannot."""
-    number = {stretch: i for i, stretch in enumerate(stretches)}
-    rivals = np.zeros((len(stretches), len(stretches)), dtype=bool)
+def _pairwise_distinct(segments: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
+    """As many segments as are soon found no two of which can be one path, as these pairs cannot."""
+    number = {segment: i for i, segment in enumerate(segments)}
+    rivals = np.zeros((len(segments), len(segments)), dtype=bool)
     for g, h in pairs:
         rivals[number[g], number[h]] = True
-    return [stretches[i] for i in large_clique(rivals)]
+    return [segments[i] for i in large_clique(rivals)]
 
 
 def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:

@@ -13,11 +13,10 @@ from ssh_abduction.engines.base import Found, Task
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 
-GROWTH = 1.25  # A prefix grows by this factor at least, so that there are few of them.
-AT_FIRST, FIRST_STEPS = (
-    8,
-    32,
-)  # So many steps are grounded in one call, up to that step: short calls cost more than the steps of a short prefix.
+# A prefix grows by this factor at least, so that there are few of them.
+GROWTH = 1.25
+# So many steps are grounded in one call until the prefix has FIRST_STEPS: for a short prefix the call costs more than the steps.
+AT_FIRST, FIRST_STEPS = 8, 32
 
 
 class StepEngine:

@@ -44,14 +44,22 @@ from ssh_abduction.steps.apart import clique
 from ssh_abduction.steps.chart import FramedChart, numbered
 from ssh_abduction.steps.localising import Located, State, faced, located, states_of
 
-SECONDS_A_PAIR = 3e-5  # what clingo takes, about, to ground two visits that may be one: it cannot be stopped meanwhile
-FIRST_PAIRS = 10_000  # visits that may be one, of which clingo is told at first
-AT_A_TIME = 20_000  # threes of visits that clingo is told of in one go
-TRY_CONFLICTS = 100  # conflicts after which it is left open whether a core can be smaller
-FAILED_TRIES = 20  # tries after which a core is kept as it is
-GROWN = 1.1  # how many times as many nodes as at first a control may have, before a new one is taken with a better order
-MANY = 5  # answers found one by one, after which they are looked for nearby
-FAR = 200  # failures to be transitive after which an answer is not nearby
+# Clingo takes so many seconds, about, to ground two visits that may be one. It cannot be stopped meanwhile.
+SECONDS_A_PAIR = 3e-5
+# Clingo is told of the first visits with so many pairs that may be one, and of others as answers need them.
+FIRST_PAIRS = 10_000
+# Clingo is told of so many threes of visits in one go, at most: they are found faster than they are grounded.
+AT_A_TIME = 20_000
+# After so many conflicts it is left open whether fewer places still clash.
+TRY_CONFLICTS = 100
+# After so many tries in vain a set of places that clash is kept as it is.
+FAILED_TRIES = 20
+# With so many times as many nodes as at first a new control is taken, as the order of choice, made for the first nodes, no longer suits.
+GROWN = 1.1
+# After so many answers found one by one the next ones are looked for nearby, which pays where there are many.
+MANY = 5
+# After so many failures to be transitive an answer is not nearby, and is asked for anew.
+FAR = 200
 
 Pair: TypeAlias = tuple[int, int, int]  # visits I < J, R: slot 0 of I is slot R of J
 Three: TypeAlias = tuple[int, int, int, int, int]  # visits I < J < K, and how I is turned to J, and J to K

@@ -1,7 +1,7 @@
 """Maps of a trace that a robot is still driving: made of guesses, or mended, in no time or in a process of their own. For theories where places have frames.
 
 Consistent by the axioms of the theory (`engines/framed.py`), but not minimal for sure. A map that the trace contradicts is mended: dstates
-stay as far as they can, what does not fit is something new, and single streets (`engines/streets.py`) say whether that is a map. Where that
+stay as far as they can, what does not fit is something new, and separate paths (`engines/paths.py`) say whether that is a map. Where that
 takes longer than a step may, it is done in the other process, in which else one guess after another is made a map.
 """
 

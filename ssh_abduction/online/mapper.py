@@ -49,6 +49,7 @@ from ssh_abduction.errors import TraceError, brief
 from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import check, unchecked
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.result import Seconds, Solution, Status
 from ssh_abduction.solver.search import ALL, Search
 from ssh_abduction.steps.log import Outcome, observation
@@ -122,6 +123,8 @@ class OnlineMapper:
         self._search: Search | None = None
         self._asked: Solution | None = None  # what it said
         self._next_search = 0  # not before the trace has so many steps
+        self._judging = Judging(Trace((first,)), self.theory)
+        self._spent = 0.0  # seconds that all steps took
         self._ask()
         self.solution = self._answer(began)
 
@@ -157,7 +160,7 @@ class OnlineMapper:
             self._replay(action, step)
             if not self._settled() and len(self._steps) >= self._next_search:
                 self._ask()
-            self._heed_guess()
+            self._absorb_guess()
             if self._may_guess():
                 contradicted = known if not self._drafts else None
                 mended = contradicted is not None and self._mend(contradicted, began)
@@ -225,7 +228,7 @@ class OnlineMapper:
         """Whether a small map is wanted, and the steps are not too many to be compared in pairs."""
         return self._status is Status.UNKNOWN and self._limit is not None and self._may_mend and len(self._steps) <= AT_ONCE
 
-    def _heed_guess(self) -> None:
+    def _absorb_guess(self) -> None:
         """Take the map that came of a guess."""
         if self._guess and self._guess.done():
             guess, self._guess = self._guess, None
@@ -272,6 +275,9 @@ class OnlineMapper:
         if status is Status.UNKNOWN and (sketch := self._best_sketch()):
             maps = (sketch.map(),)
             status, cost = Status.FEASIBLE, Cost.of(maps[0])
+        self._spent += time.perf_counter() - began
+        if maps and self._judging.has_time_for(len(self._steps), self._spent):
+            self._judging.pass_grown_map(self.trace, maps[0])
         last = self._asked
         asked = last.steps == len(self._steps)
         return Solution(

@@ -61,13 +61,21 @@ class Judging:
         if not self._shown:
             return
         steps = len(self._trace)
-        allowed = SHARE * elapsed - self._seconds
-        if self._a_step * steps <= allowed or (self._judged < ALWAYS and steps <= prefix):
+        if self.has_time_for(steps, elapsed) or (self._judged < ALWAYS and steps <= prefix):
             self._check(ssh_map, steps)
         elif self._judged < ALWAYS:
             self._check(_of_first_steps(ssh_map, prefix), prefix)
             self._look_at_sample(ssh_map, prefix)
         self._judged += 1
+
+    def has_time_for(self, steps: int, elapsed: float) -> bool:
+        """Whether a map of so many steps can be checked within the share of the time so far."""
+        return self._shown and self._a_step * steps <= SHARE * elapsed - self._seconds
+
+    def pass_grown_map(self, trace: Trace, ssh_map: SSHMap) -> None:
+        """Raise InternalError where a map breaks an axiom, that was replayed along a trace which has grown."""
+        self._trace = trace
+        self._check(ssh_map, len(trace))
 
     def _check(self, ssh_map: SSHMap, steps: int) -> None:
         began = time.perf_counter()
