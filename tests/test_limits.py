@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -162,6 +163,34 @@ def test_the_guard_speaks_while_clingo_does_not_listen(limit: float, memory: flo
             process.send_signal(number)
         out, _ = process.communicate(timeout=30)
     assert (out, process.returncode) == (f"begun, known: {why}", 10)
+
+
+def test_a_snapshot_waits_for_the_sketch_that_is_under_way(noisy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = threading.Event()
+    sketches = []
+    sketch_anew = Search._sketch_anew
+
+    def slowly(search: Search) -> None:
+        sketches.append(search)
+        begun.set()
+        time.sleep(0.2)
+        sketch_anew(search)
+
+    monkeypatch.setattr(Search, "_sketch_anew", slowly)
+    search = Search(Trace.load(noisy))
+    other = threading.Thread(target=search._sketch)
+    other.start()
+    assert begun.wait(10)
+    snapshot = search.snapshot("time limit")
+    other.join()
+    assert (len(sketches), snapshot.status, len(snapshot.maps)) == (1, Status.FEASIBLE, 1)
+
+
+def test_that_there_is_no_map_is_complete_in_a_snapshot_too() -> None:
+    search = Search(Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"]))
+    list(search)
+    snapshot = search.snapshot("time limit")
+    assert (snapshot.status, snapshot.complete) == (Status.UNSATISFIABLE, True)
 
 
 def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:

@@ -44,6 +44,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -155,6 +156,9 @@ class Search:
         self.count = 0
         self._cost: tuple[int, ...] = ()
         self._begun = False
+        self._sketching = (
+            threading.Lock()
+        )  # so that whoever asks for a snapshot waits for a sketch that is nearly done, rather than make another one
         self._apart: Evidence | None = None  # of the whole trace, where the search was stopped
         self._most = maps
         self._goes_on = after is not None
@@ -261,8 +265,7 @@ class Search:
         if self.stopped and self.status is not Status.OPTIMAL:
             if self.best is None and self.stopped == "time limit" and self._watch.has_reserve:
                 self._salvage()
-            if self.best is None:
-                self._sketch()
+            self._sketch()
             self._count_apart()
             if self.best is not None and self.status is Status.UNKNOWN:
                 self.status = Status.FEASIBLE
@@ -311,7 +314,7 @@ class Search:
         stopped  why it is to end
         """
         with suppress(Exception):  # what the other thread changes meanwhile: a bound is a bound, and a map a map, without that
-            if self.best is None and self.status in (Status.UNKNOWN, Status.FEASIBLE):
+            if self.status in (Status.UNKNOWN, Status.FEASIBLE):
                 self._sketch()
         self._raise_bound(self._engine.bound)
         best = self.best
@@ -319,7 +322,7 @@ class Search:
         if best is not None and self.status is Status.UNKNOWN:
             self.status = Status.FEASIBLE
         self.stopped = stopped
-        return replace(self.solution(known), complete=False)
+        return replace(self.solution(known), complete=self.status is Status.UNSATISFIABLE)
 
     def _evidence(self, size: int) -> Evidence | None:
         """What shows that no map has fewer dstates: of the first `size` steps."""
@@ -384,8 +387,7 @@ class Search:
     def _name_dstates(self) -> None:
         """Go on with the engine that settles dstates first, if the trace is known to have some map."""
         known = self.best.labels if self.best else None
-        if self.best is None:
-            self._sketch()
+        self._sketch()
         if self.best is not None:
             from ssh_abduction.engines.frameless import WaysEngine
 
@@ -429,9 +431,12 @@ class Search:
                 self._keep(Found.of(found, self.theory), found.labels)
 
     def _sketch(self) -> None:
-        """Where nothing was found in time: some map of the whole trace, made without a search; what goes on beyond that of a prefix, if it is better."""
-        if not self._speedups.greedy or unchecked(self.theory):
-            return
+        """Where there is no map of the whole trace yet: some map, made without a search; what goes on beyond that of a prefix, if it is better."""
+        with self._sketching:
+            if self.best is None and self._speedups.greedy and not unchecked(self.theory):
+                self._sketch_anew()
+
+    def _sketch_anew(self) -> None:
         self._merge()
         if self.best is not None:
             return
