@@ -193,6 +193,17 @@ def test_that_there_is_no_map_is_complete_in_a_snapshot_too() -> None:
     assert (snapshot.status, snapshot.complete) == (Status.UNSATISFIABLE, True)
 
 
+@POSIX
+def test_who_is_interrupted_ends_though_nobody_reads_what_is_printed() -> None:
+    program = DEAF[: DEAF.index("    control")].replace('"begun, "', '"much" * 10**6')
+    with subprocess.Popen([sys.executable, "-c", program, "0", "0"], stdout=subprocess.PIPE) as process:
+        assert process.stdout
+        assert process.stdout.read(4) == b"much"
+        time.sleep(0.5)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 143
+
+
 def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:
     """Answers its number; after so many seconds, or when it is given up."""
     ends = time.monotonic() + seconds
