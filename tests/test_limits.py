@@ -21,6 +21,7 @@ from ssh_abduction import Search, Status, Theory, Trace, solve
 from ssh_abduction.asp.control import Control
 from ssh_abduction.asp.limits import Stopped, Watch, peak_memory
 from ssh_abduction.cli import workers
+from ssh_abduction.explain import Interrupted, _Axioms
 from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.steps import certificate
 from ssh_abduction.steps.noise import noise_in
@@ -202,6 +203,13 @@ def test_who_is_interrupted_ends_though_nobody_reads_what_is_printed() -> None:
         time.sleep(0.5)
         process.send_signal(signal.SIGTERM)
         assert process.wait(10) == 143
+
+
+def test_an_explanation_can_be_stopped_while_it_grounds() -> None:
+    trace = rectangle(40)
+    asked = iter([False, False, True])
+    with pytest.raises(Interrupted):
+        _Axioms(trace, Theory.topological().resolve(trace), lambda: next(asked), 0, len(trace))
 
 
 def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:
