@@ -23,6 +23,8 @@ from ssh_abduction.trace import Trace, checked_trace
 
 # Seconds between two questions whether to stop, while clingo is busy: as in asp/limits.py.
 POLL = 0.05
+# Steps that are grounded between two such questions: eight take a moment, and more calls would take longer.
+AT_A_TIME = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +110,6 @@ class _Axioms:
     def __init__(self, trace: Trace, theory: Theory, stop: Callable[[], bool], first: int, length: int, *, relaxed: bool = False) -> None:
         trace, theory = _stretch(trace, first, length), theory.of_steps(first, length)
         self._stop = stop
-        if stop():
-            raise Interrupted
         self._control = clingo.Control(["--warn=none"])
         names = [name for name in facts.encoding_names(theory) if name not in ("preference", "show")]
         for name in [*names, "explain"] if relaxed else names:
@@ -122,8 +122,11 @@ class _Axioms:
             + facts.trace_facts(trace, theory, 0, len(trace)),
         )
         self._control.add("base", [], facts.own_rules(theory))
-        steps = [("step", facts.numbers(t)) for t in range(len(trace))]
-        self._control.ground([("base", []), *steps, ("check", facts.numbers(last))])
+        parts = [("base", list[clingo.Symbol]()), *(("step", facts.numbers(t)) for t in range(len(trace))), ("check", facts.numbers(last))]
+        for start in range(0, len(parts), AT_A_TIME):
+            if stop():
+                raise Interrupted
+            self._control.ground(parts[start : start + AT_A_TIME])
         self._control.assign_external(facts.query(last), True)
         self._control.assign_external(facts.run_by_steps(), True)
         self._pairs = {facts.active(axiom, t): (axiom, t) for axiom in theory.axioms for t in range(len(trace))} if relaxed else {}

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +21,9 @@ from ssh_abduction import Search, Status, Theory, Trace, solve
 from ssh_abduction.asp.control import Control
 from ssh_abduction.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.cli import workers
+from ssh_abduction.explain import Interrupted, _Axioms
 from ssh_abduction.judge.proof import check_bound
+from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.steps import certificate
 from ssh_abduction.steps.noise import noise_in
 
@@ -162,6 +165,52 @@ def test_the_guard_speaks_while_clingo_does_not_listen(limit: float, memory: flo
             process.send_signal(number)
         out, _ = process.communicate(timeout=30)
     assert (out, process.returncode) == (f"begun, known: {why}", 10)
+
+
+def test_a_snapshot_waits_for_the_sketch_that_is_under_way(noisy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = threading.Event()
+    sketches = []
+    sketch_anew = Candidates._sketch_anew
+
+    def slowly(candidates: Candidates) -> None:
+        sketches.append(candidates)
+        begun.set()
+        time.sleep(0.2)
+        sketch_anew(candidates)
+
+    monkeypatch.setattr(Candidates, "_sketch_anew", slowly)
+    search = Search(Trace.load(noisy))
+    other = threading.Thread(target=search._candidates.sketch)
+    other.start()
+    assert begun.wait(10)
+    snapshot = search.snapshot("time limit")
+    other.join()
+    assert (len(sketches), snapshot.status, len(snapshot.maps)) == (1, Status.FEASIBLE, 1)
+
+
+def test_that_there_is_no_map_is_complete_in_a_snapshot_too() -> None:
+    search = Search(Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"]))
+    list(search)
+    snapshot = search.snapshot("time limit")
+    assert (snapshot.status, snapshot.complete) == (Status.UNSATISFIABLE, True)
+
+
+@POSIX
+def test_who_is_interrupted_ends_though_nobody_reads_what_is_printed() -> None:
+    program = DEAF[: DEAF.index("    control")].replace('"begun, "', '"much" * 10**6')
+    with subprocess.Popen([sys.executable, "-c", program, "0", "0"], stdout=subprocess.PIPE) as process:
+        assert process.stdout
+        assert process.stdout.read(4) == b"much"
+        time.sleep(0.5)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 143
+
+
+def test_an_explanation_can_be_stopped_while_it_grounds() -> None:
+    trace = rectangle(40)
+    asked = iter([False, False, True])
+    with pytest.raises(Interrupted):
+        _Axioms(trace, Theory.topological().resolve(trace), lambda: next(asked), 0, len(trace))
 
 
 def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:

@@ -121,6 +121,15 @@ def test_no_name_is_no_file(words: str, capsys: pytest.CaptureFixture[str]) -> N
     assert "expected the name of a file or folder, got ''" in capsys.readouterr().err or words.endswith("--plot")
 
 
+@pytest.mark.parametrize(
+    "words", ["train x y -o=--", "evaluate x y --folds=--", "show x --map=--", "solve x --rules=--", "check x y --prefer=--"]
+)
+def test_two_dashes_are_no_value(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(words.split())
+    assert "expected a value, got '--'" in capsys.readouterr().err
+
+
 def test_every_verb_that_writes_writes_into_a_pipe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run.jsonl"
     assert main(["simulate", "notched-rectangle", "--tours", "2", "--no-stars", "-o", str(run)]) == 0

@@ -61,10 +61,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
 
 
+def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The options. argparse takes the -- of --map=-- for the end of all options, and the option is left with an empty list."""
+    top = parser()
+    options = top.parse_args(arguments)
+    for name, value in vars(options).items():
+        if isinstance(value, list) and (not value or [] in value):
+            top.error(f"{name}: expected a value, got '--'")
+    return options
+
+
 def _main(arguments: Sequence[str] | None) -> int:
     if sys.stderr is None:
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - for as long as the program runs
-    options = parser().parse_args(arguments)
+    options = _parsed(arguments)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that knows no "→" shows "?"

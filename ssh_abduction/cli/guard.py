@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 from ssh_abduction.asp.limits import POLL, Stop, resident_memory
 from ssh_abduction.asp.process import end_all
@@ -23,6 +23,7 @@ from ssh_abduction.asp.process import end_all
 LATE = 1.1, 0.4  # times the time limit, and seconds beyond that, after which a search is over, whatever it is at
 LARGE = 1.1, 100.0  # times the memory limit, and MiB beyond that
 DEAF = 1.5  # seconds that a search may take to end after Ctrl-C
+PIECE = 2**16  # characters that are printed at a time
 
 
 class Guard:
@@ -53,7 +54,9 @@ class Guard:
         self._over = threading.Event()
         self._deaf_at: float | None = None  # when the search should have ended after Ctrl-C
         self._waited = 0.0  # seconds that whoever reads the output took, which do not count
+        self._writes_since: float | None = None  # when the piece of text that is being printed was begun
         self._began = time.monotonic()
+        self._signal = int(signal.SIGINT)  # that asked for an end
         self._hears: socket.socket | None = None
         self._before = -1
 
@@ -79,9 +82,11 @@ class Guard:
         """Print a text, which is made here, so that the last words know whether it was printed."""
         with self._speaking:
             made = text()
-            began = time.monotonic()
-            sys.stdout.write(made)
-            self._waited += time.monotonic() - began
+            for start in range(0, len(made), PIECE):
+                self._writes_since = time.monotonic()
+                sys.stdout.write(made[start : start + PIECE])
+                self._waited += time.monotonic() - self._writes_since
+                self._writes_since = None
 
     def _watch(self) -> None:
         while not self._over.wait(POLL):
@@ -95,13 +100,16 @@ class Guard:
                         self._end(why)
                 finally:
                     self._speaking.release()
+            elif self._is_unread():
+                self._leave(128 + self._signal)
 
     def _is_called(self) -> bool:
         """Whether somebody asks for an end."""
         if self._hears is not None:
             with suppress(BlockingIOError):
-                if {signal.SIGINT, signal.SIGTERM} & set(self._hears.recv(64)):
-                    return True
+                heard = [number for number in self._hears.recv(64) if number in (signal.SIGINT, signal.SIGTERM)]
+                self._signal = heard[-1] if heard else self._signal
+                return bool(heard) or self._given_up()
         return self._given_up()
 
     def _why(self) -> Stop | None:
@@ -113,6 +121,11 @@ class Guard:
         if self._memory is not None and resident_memory() > LARGE[0] * self._memory + LARGE[1]:
             return "memory limit"
         return None
+
+    def _is_unread(self) -> bool:
+        """Whether the program is to end, and prints what nobody reads."""
+        since, now = self._writes_since, time.monotonic()
+        return self._deaf_at is not None and now > self._deaf_at and since is not None and now > since + DEAF
 
     def _end(self, why: Stop) -> None:
         """Print the last words, and end the process with its helpers. What Python and clingo hold is left to the system."""
@@ -129,8 +142,11 @@ class Guard:
                     flush=True,
                 )
         finally:
-            end_all()
-            os._exit(code)
+            self._leave(code)
+
+    def _leave(self, code: int) -> NoReturn:
+        end_all()
+        os._exit(code)
 
 
 def _print(words: str) -> None:

@@ -15,6 +15,8 @@ from ssh_abduction.explain import Explanation, Interrupted, explain
 from ssh_abduction.files import json_line
 from ssh_abduction.solver import Search, Solution, Status
 
+SOON = 10_000  # steps of a trace in which noise is sought after Ctrl-C, at most: in 40,000 that takes two seconds
+
 _heard: list[int] = []  # signals that asked for an end
 EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}
 
@@ -71,6 +73,8 @@ def ending(search: Search, solution: Solution, explanation: Explanation | None, 
 
 def warnings_of(search: Search, solution: Solution) -> list[str]:
     """What makes the trace suspicious, a sentence each."""
+    if solution.stopped == "interrupted" and len(search.trace) > SOON:
+        return []
     return [solution.noise.sentence(search.trace)] if solution.noise else []
 
 

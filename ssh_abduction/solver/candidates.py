@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 
 from ssh_abduction.asp import facts
@@ -24,6 +25,9 @@ class Candidates:
 
     def __init__(self, task: Task, known: Known, judging: Judging, report: Callable[[], None]) -> None:
         self._task, self._known, self._judging, self._report = task, known, judging, report
+        self._sketching = (
+            threading.Lock()
+        )  # so that who asks for a snapshot waits for a sketch that is nearly done, rather than make another one
 
     def merge(self) -> None:
         """Make a causal map by merging steps greedily: at once, and not minimal."""
@@ -31,9 +35,12 @@ class Candidates:
             self._offer(facts.causal_map(self._task.log.merged(), self._task.trace))
 
     def sketch(self) -> None:
-        """Make some map without a search: what goes on beyond the best map of a prefix, or a sketch of all steps, if that is better."""
-        if not self._task.speedups.greedy or unchecked(self._task.theory):
-            return
+        """Where no map of the whole trace is known yet, make some without a search: what goes on beyond the best map of a prefix, or a sketch of all steps."""
+        with self._sketching:
+            if self._known.best is None and self._task.speedups.greedy and not unchecked(self._task.theory):
+                self._sketch_anew()
+
+    def _sketch_anew(self) -> None:
         self.merge()
         if self._known.best is not None:
             return

@@ -287,8 +287,7 @@ class Search:
     def _settle_dstates_first(self) -> None:
         """Go on with the engine that settles dstates before places and paths, if the trace is known to have some map."""
         labels = self.best.labels if self.best else ()
-        if self.best is None:
-            self._candidates.sketch()
+        self._candidates.sketch()
         if self.best is not None:
             from ssh_abduction.engines.frameless import FramelessEngine
 
@@ -327,8 +326,7 @@ class Search:
             return
         if self.best is None and self.stopped == "time limit" and self._watch.has_reserve:
             self._salvage()
-        if self.best is None:
-            self._candidates.sketch()
+        self._candidates.sketch()
         self._count_apart()
         if self.best is not None and self.status is Status.UNKNOWN:
             self._known.status = Status.FEASIBLE
@@ -397,14 +395,14 @@ class Search:
         stopped  why it is to end
         """
         with suppress(Exception):  # what the other thread changes meanwhile: a bound is a bound, and a map a map, without that
-            if self.best is None and self.status in (Status.UNKNOWN, Status.FEASIBLE):
+            if self.status in (Status.UNKNOWN, Status.FEASIBLE):
                 self._candidates.sketch()
         self._known.raise_bound(self._prefixes.engine.bound)
         best = self.best
         if best is not None and self.status is Status.UNKNOWN:
             self._known.status = Status.FEASIBLE
         self._known.stopped = stopped
-        return replace(self.solution(() if best is None else (best,)), complete=False)
+        return replace(self.solution(() if best is None else (best,)), complete=self.status is Status.UNSATISFIABLE)
 
     def _basis_of(self, size: int) -> Basis | None:
         """What shows that no map has fewer dstates: of the first `size` steps."""
