@@ -20,7 +20,7 @@ from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.engines import base as engine
 from ssh_abduction.engines import framed
-from ssh_abduction.engines import paths as streets
+from ssh_abduction.engines import paths as paths_module
 from ssh_abduction.engines import visits as same
 from ssh_abduction.engines.base import Cost, Found
 from ssh_abduction.engines.framed import FramedEngine
@@ -129,7 +129,7 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         prefixes,
         patch.multiple(same, **cores),
         patch.multiple(framed, **sought),
-        patch.object(streets, "SECONDS", 0.0),
+        patch.object(paths_module, "SECONDS", 0.0),
         patch.multiple(annealing, ANNEALED=((0.5, data.draw(st.integers(1, 20), label="sweeps")),), LAST=2),
         patch.object(FramedEngine, "_charted", charted),
         patch.object(engine.Task, "has_processors", processors),
@@ -152,13 +152,13 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(framed_traces(), framed_theories(), st.integers(0, 20))
 def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: Theory, sweeps: int) -> None:
-    """From a guess of any quality. Names that do not fit a frame, or have no streets, are no maps; and clingo may need more names than it had."""
+    """From a guess of any quality. Names that do not fit a frame, or have no paths, are no maps; and clingo may need more names than it had."""
     expected = solve(trace, theory, maps=0, speedups=PLAIN)
     with (
         patch.object(solver, "FEW_STEPS", 0),
         patch.multiple(framed, SOON=-1.0, Beside=Before, MANY_DSTATES=sweeps % 2),
         patch.object(same, "FIRST_PAIRS", 5 * (sweeps % 3)),
-        patch.object(streets, "SECONDS", 0.0),
+        patch.object(paths_module, "SECONDS", 0.0),
         patch.multiple(annealing, ANNEALED=((0.5, sweeps),), LAST=2),
         patch.object(engine.Task, "has_processors", True),
         patch.object(FramedEngine, "_named_at", always_named_at),
@@ -196,7 +196,7 @@ def test_a_limit_ends_the_search_beside(limit: float) -> None:
 
 @pytest.mark.parametrize(("side", "steps", "seed"), [(4, 120, 7), (5, 200, 4)])
 def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, seed: int) -> None:
-    """There are several in these mazes, most of which have no streets."""
+    """There are several in these mazes, most of which have no paths."""
     walk = maze(side, side, steps=steps, seed=seed, stars=True)
     expected = solve(walk.trace, Theory.topological(), maps=0, speedups=Speedups.without("annealed"))
     with (
@@ -239,10 +239,10 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(trace: Trace, the
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
-    """Long enough for cores, for visits told to be transitive, and for streets, all of which the longer trace keeps."""
+    """Long enough for cores, for visits told to be transitive, and for paths, all of which the longer trace keeps."""
     trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
     first, *rest = trace.steps
-    streets = set()
+    paths = set()
     with patch.multiple(same, GROWN=100, MANY=1, AT_A_TIME=5), patch.object(solver, "FEW_STEPS", 10):
         mapper = OnlineMapper(first.view or "", star=first.star, limit=None, maps=0)
         for i, (action, step) in enumerate(zip(trace.actions, rest, strict=True)):
@@ -253,9 +253,9 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
                 assert set(answer.maps) == set(expected.maps)
             engine = mapper._search and mapper._search._prefixes.engine
             if isinstance(engine, FramedEngine):
-                streets.add((engine._visits.batch, len(engine._sides._said)))
-    assert max(streets)[0] > 5
-    assert seed != 0 or any(told for _, told in streets)
+                paths.add((engine._visits.batch, len(engine._sides._said)))
+    assert max(paths)[0] > 5
+    assert seed != 0 or any(told for _, told in paths)
 
 
 @pytest.mark.parametrize("off", ["", "clique", "core_guided", "sides"])
@@ -358,13 +358,15 @@ def test_pinned_stretches_leave_all_maps(seed: int, pinned: int, stretches: int)
     trace = maze(4, 4, steps=100, seed=seed, stars=True).trace
     given: list[tuple[list[int], Sequence[int]]] = []
 
-    def rivals(among: Sequence[int], pairs: Sequence[tuple[int, int]], sought: Callable[..., list[int]] = streets._rivals) -> list[int]:
+    def rivals(
+        among: Sequence[int], pairs: Sequence[tuple[int, int]], sought: Callable[..., list[int]] = paths_module._pairwise_distinct
+    ) -> list[int]:
         found = sought(among, pairs)
         assert set(combinations(found, 2)) <= set(pairs)
         given.append((found, among))
         return found
 
-    with patch.object(streets, "_rivals", rivals):
+    with patch.object(paths_module, "_pairwise_distinct", rivals):
         maps = solve(trace, maps=0).maps
     assert any((len(found), len(among)) == (pinned, stretches) for found, among in given)
     assert len(maps) > 1
@@ -418,10 +420,10 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
             leaves = [(visit, *how) for visit, how in chart.leaves.items()]
             control.add("visits", [], facts.visit_facts(0, given, leaves, pairs))
             control.add("visits", [], facts.turn_facts(0, chart, range(len(chart.stars)), chart.turns(trace)))
-            control.add("visits", [], facts.side_facts(theory))
+            control.add("visits", [], facts.sides_framed_facts(theory))
             control.add("visits", [], "\n".join(f":- not same({i},{j},{r})." for i, j, r in pairs))
-            street = ("street", facts.numbers(*chart.facing[labels.index(dstate)], 0))
-            control.ground([("visits", []), ("more", facts.numbers(0)), ("sides", []), ("streets", facts.numbers(0)), street])
+            street = ("path", facts.numbers(*chart.facing[labels.index(dstate)], 0))
+            control.ground([("visits", []), ("more", facts.numbers(0)), ("sides", []), ("paths", facts.numbers(0)), street])
             allowed = next(engine.asker.answers(lambda _: True, "ignore", 1, control=control), False)
             assert not (allowed and dstate in contrary)
             assert allowed or {y for x, y, _ in segments if x == dstate} & set(contrary)
@@ -429,7 +431,7 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
 
 
 def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
-    """LimitError while streets are sought for the fewest dstates, and while the dstates are."""
+    """Stopped while paths are sought for the fewest dstates, and while the dstates are."""
     walk = maze(3, 3, steps=200, seed=1, stars=True)
     with patch.object(FramedEngine, "_all_with_paths", side_effect=KeyboardInterrupt), patch.object(engine, "FIRST_PREFIXES", 300):
         search = Search(walk.trace, Theory.topological())
@@ -447,7 +449,7 @@ def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
 
 @pytest.mark.parametrize(("seed", "fewest", "paths"), [(0, 57, 7), (1, 58, 5), (2, 53, 7)])
 def test_a_maze_half_explored_is_mapped(seed: int, fewest: int, paths: int) -> None:
-    """Few views tell little: order and sides have to. In the last one some dstates have no streets though no single street shows it."""
+    """Few views tell little: order and sides have to. In the last one some dstates have no paths though no single path shows it."""
     trace = maze(10, 10, steps=4000, seed=seed, stars=True).trace.prefix(150)
     solution = solve(trace, Theory.topological(), maps=3, limit=60)
     assert solution.status is Status.OPTIMAL
@@ -628,7 +630,7 @@ def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: T
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(framed_traces(), framed_theories(), st.lists(st.integers(-1, 4), min_size=9, max_size=9), st.booleans())
 def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[int], told: bool) -> None:
-    """Of the causal axioms; and where single streets fit it, others do."""
+    """Of the causal axioms; and where separate paths fit it, others do."""
     asked = framed_engine(trace, theory)
     chart = asked._chart
     if chart is None:
@@ -661,7 +663,7 @@ def test_a_true_guess_stays_as_it_is(seed: int) -> None:
 
 @pytest.mark.parametrize(("size", "steps", "seed"), [(5, 300, 0), (6, 300, 2), (8, 600, 1)])
 def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, seed: int) -> None:
-    """Where the causal axioms do not show that they are two, but streets do."""
+    """Where the causal axioms do not show that they are two, but paths do."""
     walk = maze(size, size, steps=steps, seed=seed, stars=True)
     asked = framed_engine(walk.trace, Theory.topological())
     chart, known = asked._chart, asked._paths
@@ -705,7 +707,7 @@ def test_a_guess_begins_sooner_under_a_short_limit(limit: float | None, waited: 
 
 
 def test_labels_that_take_too_long_to_try_are_left() -> None:
-    """Where no single streets fit them, and there is no time to ground all; the search goes on."""
+    """Where no separate paths fit them, and there is no time to ground all; the search goes on."""
     walk = maze(3, 3, steps=200, seed=0, stars=True)
     asked = framed_engine(walk.trace, Theory.topological())
     labels = node_labels(solve(walk.trace, Theory.topological(), maps=1).maps[0], asked._chart)
@@ -745,7 +747,7 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, mo
             failed.append(wrong)
             yield wrong, guess
 
-    with patch.object(annealing, "ANNEALED", ((0.5, 100),)), patch.object(streets, "attempts", counted):
+    with patch.object(annealing, "ANNEALED", ((0.5, 100),)), patch.object(paths_module, "attempts", counted):
         labels = asked._paths.guessed_labels(chart, Watch())
     assert failed[0] > 0
     assert asked._paths.has_separate(chart, labels)

@@ -336,7 +336,10 @@ def test_noise_is_told_where_the_search_is_stopped_after_a_minimal_map_is_known(
     search = Search(flawed, Theory.causal())
     list(search)
     assert search.status is Status.OPTIMAL
-    search._engine.size, search.stopped = 0, "time limit"  # as where the limit ends the listing while clingo is given more
+    search._prefixes.engine._named.size, search._known.stopped = (
+        0,
+        "time limit",
+    )  # as where the limit ends the listing while clingo is given more
     noise = search.solution().noise
     assert noise
     assert noise.step == 40

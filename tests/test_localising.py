@@ -12,7 +12,7 @@ import pytest
 from benchmarks.instances import Walk, maze
 from ssh_abduction import Search, Theory, solve
 from ssh_abduction.asp.limits import Watch
-from ssh_abduction.engines import paths as streets
+from ssh_abduction.engines import paths as paths_module
 from ssh_abduction.engines import visits as same
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.engines.paths import Paths
@@ -103,7 +103,7 @@ def test_a_long_trace_is_solved_from_few_of_its_visits(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_beginning_of_a_long_trace_is_guessed(seed: int) -> None:
-    """And the rest follows from it, or twice as many visits are guessed, until all are. Either way it is a map with streets."""
+    """And the rest follows from it, or twice as many visits are guessed, until all are. Either way it is a map with paths."""
     walk = maze(3, 3, steps=700, seed=seed, stars=True)
     chart = charted(walk)
     guessed: list[int] = []
@@ -114,7 +114,7 @@ def test_the_beginning_of_a_long_trace_is_guessed(seed: int) -> None:
         return begun(self, part, check)
 
     asked = Paths(walk.trace, FRAMED)
-    with patch.object(streets, "FIRST_PAIRS", 300), patch.object(Paths, "_guessed", counted):
+    with patch.object(paths_module, "FIRST_PAIRS", 300), patch.object(Paths, "_guessed", counted):
         found = asked.guessed_labels(chart, Watch())
     assert guessed[0] < len(chart.stars) / 2
     assert all(later in {2 * earlier, len(chart.stars)} for earlier, later in pairwise(guessed))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from itertools import islice, product
+from pathlib import Path
 from unittest.mock import patch
 
 import clingo
@@ -20,6 +23,7 @@ from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import LimitError
 from ssh_abduction.engines import base as engine
+from ssh_abduction.engines import framed
 from ssh_abduction.engines import naming as named
 from ssh_abduction.engines.nearby import NearbySearch
 from ssh_abduction.guesses import annealing
@@ -93,16 +97,64 @@ def test_names_read_from_where_actions_lead_are_those_read_whole(seed: int) -> N
     assert not all(rests)
 
 
-@pytest.mark.parametrize("off", NAMES)
-@pytest.mark.parametrize(
-    "theory", [Theory.causal(), Theory.topological(), Theory.circumscriptive()], ids=["causal", "topological", "circumscriptive"]
-)
-def test_each_speedup_off_alone(off: str, theory: Theory) -> None:
-    trace = Trace.from_steps([f"v{i % 4}" for i in range(24)], [("right", "travel")[i % 2] for i in range(23)])
-    with patch.object(solver, "FEW_STEPS", 0):
-        found, expected = solve(trace, theory, maps=0, speedups=Speedups.without(off)), solve(trace, theory, maps=0)
-    assert set(found.maps) == set(expected.maps)
-    assert found.cost == expected.cost
+@contextmanager
+def noted_reads() -> Iterator[set[str]]:
+    """The speed-ups that are asked for meanwhile, but by the table itself."""
+    read: set[str] = set()
+    get = Speedups.__getattribute__
+
+    def noted(self: Speedups, name: str) -> object:
+        if name in NAMES and Path(sys._getframe(1).f_code.co_filename).name not in ("speedups.py", "dataclasses.py"):
+            read.add(name)
+        return get(self, name)
+
+    with patch.object(Speedups, "__getattribute__", noted):
+        yield read
+
+
+CIRCUITS = Trace.from_steps([f"v{i % 4}" for i in range(24)], [("right", "travel")[i % 2] for i in range(23)])
+CASES = {
+    "causal": (moore(6, 2, steps=60, seed=1).trace, Theory.causal()),
+    "topological": (CIRCUITS, Theory.topological()),
+    "circumscriptive": (CIRCUITS, Theory.circumscriptive()),
+    "framed": (maze(2, 2, steps=40, seed=1, stars=True).trace, Theory.topological()),
+    "frameless": (maze(2, 2, steps=30, seed=1).trace, Theory.topological()),
+}
+
+
+@contextmanager
+def hurried() -> Iterator[None]:
+    """What is done only where a search takes its time is done at once."""
+    with (
+        patch.multiple(solver, FEW_STEPS=0, FRAME_AFTER=-1.0),
+        patch.multiple(named, PATIENCE=0, CORES=0),
+        patch.multiple(framed, SOON=-1.0, GUESS_FIRST=-1.0),
+    ):
+        yield
+
+
+def reads_of(case: str) -> list[str]:
+    """The speed-ups that a search of this case asks for."""
+    trace, theory = CASES[case]
+    with noted_reads() as read, hurried():
+        solve(trace, theory, maps=0)
+    return [name for name in NAMES if name in read]
+
+
+def test_each_speedup_is_asked_for_in_some_case() -> None:
+    """Else the cases below would say nothing of it."""
+    assert {name for case in CASES for name in reads_of(case)} == set(NAMES)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_each_speedup_that_is_read_off_alone(case: str) -> None:
+    trace, theory = CASES[case]
+    with hurried():
+        expected = solve(trace, theory, maps=0)
+        for off in reads_of(case):
+            found = solve(trace, theory, maps=0, speedups=Speedups.without(off))
+            assert set(found.maps) == set(expected.maps), off
+            assert found.cost == expected.cost, off
 
 
 @pytest.mark.parametrize("most", [1, 2, 5])

@@ -343,7 +343,7 @@ def listed(batch: int) -> Symbol:
     return Function("listed", numbers(batch))
 
 
-def alone(place: int) -> Symbol:
+def first(place: int) -> Symbol:
     """The atom that the node at this position of the order is the first at its dstate."""
     return Function("first", numbers(place))
 
@@ -413,7 +413,7 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
     return SSHMap(found, tuple(DState(i, _view(trace, t)) for i, t in enumerate(first)), links_of(found, trace))
 
 
-def street_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
+def paths_framed_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
     """What happened at the nodes of a chart, as facts for paths_framed.lp."""
     facts = [f"rotated({s},{x},{-action})." for s, action, x in chart.links if action < 0]
     facts += [f"travelled({s},{x})." for s, _, x in chart.travels]
@@ -421,23 +421,23 @@ def street_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
     facts += [f"excluded({s},{x})." for s, x in chart.excluded]
     visits = {(chart.facing[s][0], chart.facing[x][0]): (s, x) for s, x in chart.away}
     facts += [f"far_nodes({s},{x})." for s, x in visits.values()]
-    return "\n".join([*facts, side_facts(theory)])
+    return "\n".join([*facts, sides_framed_facts(theory)])
 
 
-def side_facts(theory: Theory) -> str:
+def sides_framed_facts(theory: Theory) -> str:
     """Which axioms of the sides of paths hold in a theory, as facts."""
     facts = ["sided."] if theory.boundary != "none" else []
     facts += ["symmetric."] if theory.symmetric_sides else []
     return "\n".join(facts)
 
 
-def way_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
+def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
     """Which numbered actions are travels and turns, and which axioms of sides hold, as facts for sides_frameless.lp."""
     kinds = [f"turns({a},{action.turn})." if action.turn else f"travels({a})." for a, action in actions.items()]
-    return "\n".join([*kinds, side_facts(theory)])
+    return "\n".join([*kinds, sides_framed_facts(theory)])
 
 
-def course_facts(
+def paths_frameless_facts(
     theory: Theory,
     dstates: Iterable[int],
     links: Iterable[tuple[int, int, int]],
@@ -451,7 +451,7 @@ def course_facts(
     far     pairs of dstates that evidence says are not at one place
     single  ask only for places and paths in which no two places and no two segments are one, unless they have to be
     """
-    facts = [side_facts(theory), *(["total."] if theory.path_order == "total" else []), *(["single."] if single else [])]
+    facts = [sides_framed_facts(theory), *(["total."] if theory.path_order == "total" else []), *(["single."] if single else [])]
     facts += [f"is({x})." for x in dstates]
     facts += [f"far({x},{y})." for x, y in far]
     facts += [f"turn({s},{turn},{x})." if (turn := actions[a].turn) else f"travel({s},{x})." for s, a, x in links]
@@ -542,7 +542,7 @@ def forbidden_links(links: Iterable[tuple[int, int, int]], placed: Iterable[tupl
 
 
 @dataclass(frozen=True, slots=True)
-class StreetAnswer:
+class PathAnswer:
     """An answer of paths_framed.lp or paths_frameless.lp.
 
     at     for each place that the turns tell, the place that it is at, and how it is turned to it
@@ -555,7 +555,7 @@ class StreetAnswer:
     order: dict[int, list[int]]
 
 
-class StreetReader:
+class PathReader:
     """Reads maps from answers of paths_framed.lp or paths_frameless.lp, for one labelling of the nodes. What the labels alone tell is worked out once.
 
     Instead of reading all atoms of an answer, this asks it for the atoms that can be in it, beginning with those of the answer before. That takes a third of
@@ -584,13 +584,13 @@ class StreetReader:
         self._placed: _Placed | None = None  # what the places of the last map tell, as they are mostly the same in the next
         self._made: dict[tuple[object, ...], DState] = {}  # dstates made so far, as most of them are in most maps
 
-    def read(self, model: Model) -> StreetAnswer:
+    def read(self, model: Model) -> PathAnswer:
         """The values that map_of needs of an answer."""
         at, part = self._at.made_in(model), self._part.made_in(model)
         on: dict[int, dict[int, None]] = {}  # for each path, the places on it
         for segment, component in self._passes:
             on.setdefault(part[segment][0], {})[at[component][0]] = None
-        return StreetAnswer(at, part, {path: self._ordered(model, path, places) for path, places in on.items()})
+        return PathAnswer(at, part, {path: self._ordered(model, path, places) for path, places in on.items()})
 
     def _ordered(self, model: Model, path: int, places: Collection[int]) -> list[int]:
         """The places of a path in order. This begins with their order in the last answer, which is mostly nearly the same."""
@@ -613,7 +613,7 @@ class StreetReader:
             literal = self._before[ahead] = atom.literal if atom else 0
         return literal != 0 and model.is_true(literal)
 
-    def map_of(self, answer: StreetAnswer) -> SSHMap:
+    def map_of(self, answer: PathAnswer) -> SSHMap:
         """The map that an answer describes."""
         placed = self._placed
         if placed is None or placed.at != answer.at:
@@ -655,7 +655,7 @@ class StreetReader:
 class _Placed:
     """What the places of an answer tell of a map.
 
-    at       as in StreetAnswer
+    at       as in PathAnswer
     number   for each place, its number in the map
     dstates  the dstates of the map, without paths
     along    the dstates of a segment with their paths, by the segment, the path that it is part of, and in which direction

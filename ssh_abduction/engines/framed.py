@@ -398,7 +398,7 @@ class FramedEngine:
         control = naming.control or self._path_control(naming.labels)
         alone = mode == "opt" and len(set(naming.labels)) > MANY_DSTATES and not self._beside and self._task.has_processors
         give_threads(control, two=alone)  # which keep all that they list
-        reader = facts.StreetReader(control, self._task.trace, self._task.theory, chart or self._chart, naming.labels)
+        reader = facts.PathReader(control, self._task.trace, self._task.theory, chart or self._chart, naming.labels)
         answers = self.asker.answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
         return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), self._task.theory), answers))
 

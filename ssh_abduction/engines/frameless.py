@@ -187,25 +187,25 @@ class PlacesAndPaths:
             parts: list[tuple[str, list[clingo.Symbol]]] = []
             if not self._told:
                 control.load(encodings.path("sides_frameless"))
-                control.add("ways", [], facts.way_facts(self._task.theory, self._actions))
-                parts.append(("ways", []))
-            parts += [("way", facts.numbers(names[dstate])) for dstate in dstates]
+                control.add("sides", [], facts.sides_frameless_facts(self._task.theory, self._actions))
+                parts.append(("sides", []))
+            parts += [("path", facts.numbers(names[dstate])) for dstate in dstates]
             control.ground(parts)  # in one go: that takes half as long, and searching, too
             self._told.update(dstates)
 
     def fits(self, labels: Sequence[int]) -> bool:
-        return self._has_courses(self._least_courses(labels))
+        return self._has_paths(self._path_control(labels))
 
     def why_not(self, labels: list[int]) -> list[int] | None:
         """Labels that no places and paths fit; None where some do."""
         return None if self.fits(labels) else labels
 
-    def _has_courses(self, control: clingo.Control) -> bool:
+    def _has_paths(self, control: clingo.Control) -> bool:
         return next(self._asker.answers(lambda _: True, "ignore", 1, control=control), False)
 
     def forbid(self, labels: Sequence[int]) -> None:
         links = self._links_of(labels)
-        control = self._courses(links, parts=("base",))
+        control = self._control_for(links, parts=("base",))
         contrary = next(self._asker.answers(facts.read_contraries, "ignore", 1, control=control))
         dstate_of = {name: dstate for dstate, name in self.named.names().items()}
         new = [dstate for name in contrary if (dstate := dstate_of.get(name)) is not None and dstate not in self._told][:CONTRARY]
@@ -221,7 +221,7 @@ class PlacesAndPaths:
     def _clashing(self, members: list[Link | _Far]) -> list[Link | _Far] | None:
         """These links, and dstates that are far from each other, if no places and paths fit them."""
         some = _Members.of(members)
-        found = any(self._has_courses(self._courses(some.links, far=some.far, single=single)) for single in (True, False))
+        found = any(self._has_paths(self._control_for(some.links, far=some.far, single=single)) for single in (True, False))
         return None if found else members
 
     def _far_away(self, labels: Sequence[int]) -> list[_Far]:
@@ -234,7 +234,7 @@ class PlacesAndPaths:
         """The links that these labels of all steps make, each once."""
         return list(dict.fromkeys((labels[t], action, labels[u]) for t, action, u in self.named.chart.links))
 
-    def _courses(
+    def _control_for(
         self,
         links: Collection[Link],
         dstates: Iterable[int] = (),
@@ -248,16 +248,18 @@ class PlacesAndPaths:
         control = Control(options, self._asker.watch.check, PREPARING)
         control.load_encodings("paths_frameless", "preference")
         dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links), *(f[:2] for f in far)))
-        control.add("base", [], facts.course_facts(self._task.theory, dstates, links, self._actions, [f[:2] for f in far], single=single))
+        control.add(
+            "base", [], facts.paths_frameless_facts(self._task.theory, dstates, links, self._actions, [f[:2] for f in far], single=single)
+        )
         control.ground([(part, []) for part in parts])
         return control
 
-    def _least_courses(self, labels: Sequence[int], options: Sequence[str] = ()) -> clingo.Control:
+    def _path_control(self, labels: Sequence[int], options: Sequence[str] = ()) -> clingo.Control:
         """A control for the places and paths that fit these labels of all steps. The last one is kept, as the next question is often to it."""
         key = tuple(labels), tuple(options)
         if self._asked is None or self._asked[0] != key:
             with self._asker.grounding_timed():
-                control = self._courses(self._links_of(labels), labels, options, far=self._far_away(labels))
+                control = self._control_for(self._links_of(labels), labels, options, far=self._far_away(labels))
             self._asker.watch.check()
             self._asked = key, control
         return self._asked[1]
@@ -270,7 +272,7 @@ class PlacesAndPaths:
 
     def maps(self, labels: Sequence[int], mode: str, conflicts: int = -1, options: Sequence[str] = ()) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
-        control = self._least_courses(labels, options)
-        reader = facts.StreetReader(control, self._task.trace, self._task.theory, self.named.chart, labels)
+        control = self._path_control(labels, options)
+        reader = facts.PathReader(control, self._task.trace, self._task.theory, self.named.chart, labels)
         answers = self._asker.answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
         return (yield from mapped(lambda answer: Found.of(reader.map_of(answer).without_headings(), self._task.theory), answers))

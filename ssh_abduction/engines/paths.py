@@ -81,7 +81,7 @@ class Paths:
         """A control with these axioms, and what happened; nothing is grounded yet."""
         control = Control(options, self._check, PREPARING)
         control.load_encodings("paths_framed")
-        control.add("base", [], facts.street_facts(self._trace, self._theory, chart))
+        control.add("base", [], facts.paths_framed_facts(self._trace, self._theory, chart))
         return control
 
     def contrary(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:

@@ -235,7 +235,7 @@ class VisitLabels:
         self._asker.control.assign_external(facts.listed(self.batch), True)
         atoms = self._asker.control.symbolic_atoms
         for place, *_ in nodes:
-            atom = atoms[facts.alone(place)]
+            atom = atoms[facts.first(place)]
             if atom and (atom.is_fact or not self._task.speedups.core_guided):
                 self.least += atom.is_fact
             elif atom:
