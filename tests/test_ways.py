@@ -117,7 +117,7 @@ def test_few_of_many_maps() -> None:
     assert all(check(trace, ssh_map, every.theory) == () for ssh_map in every.maps)
 
 
-@pytest.mark.parametrize("name", ["forget", "why_not", "_control_for"])
+@pytest.mark.parametrize("name", ["forget", "fits", "_control_for"])
 def test_what_ends_it_leaves_the_map_with_frames(name: str) -> None:
     """Whatever it is at: the map that was known before is the answer."""
     trace = maze(2, 2, steps=120, seed=1).trace

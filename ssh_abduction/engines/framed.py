@@ -111,7 +111,7 @@ class FramedEngine:
         self._task, self._around, self._soon = task, around, soon
         self._sides = FramedSides(task.theory, self.asker)
         self._visits = VisitLabels(task, self.asker, self._charted, self._sides)
-        self._size = 0
+        self._unframed_size = 0  # how many steps there are where they fit no frames
         self._framed = True  # whether the visits fit their frames
         self._forget()
 
@@ -128,7 +128,7 @@ class FramedEngine:
 
     @property
     def size(self) -> int:
-        return self._size
+        return self._visits.size if self._framed else self._unframed_size
 
     @property
     def bound(self) -> int | None:
@@ -158,9 +158,8 @@ class FramedEngine:
         if size != self.size:
             self._end_beside()
             self._forget()
-        self._size = 0  # until all of it is known
         self._framed = self._visits.grow(size)
-        self._size = size
+        self._unframed_size = size
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         if not self._framed:
