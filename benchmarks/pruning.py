@@ -91,14 +91,16 @@ TRIALS = (
     *_timed("clique", QUICK_MAZE, MACHINE_16, STARS),
     *_timed("lazy", QUICK_MAZE, MACHINE_16, CORRIDORS, STARS),
     *_timed("core_guided", QUICK_MAZE, MACHINE_16, STARS),
-    *_timed("sides", STARS, FEW_SEEN, TAYLOR),
+    *_timed("sides", STARS, TAYLOR),
+    *_timed("sides", FEW_SEEN, "full maze 10x10 n=200", limit=LONGER),
     *_timed("ways", BARE_CORRIDORS, BARE.name, LARGE_BLOCK, limit=2 * LIMIT),
     *_timed("prefixes", SMALL_BLOCK, BLOCK, TAYLOR),
-    *_timed("path_names", SMALL_BLOCK, BARE_CORRIDORS, PATTERNS),
+    *_timed("path_names", SMALL_BLOCK, LARGE_BLOCK, BARE_CORRIDORS, PATTERNS),
     *_timed("framing", BARE.name, limit=2 * LIMIT),
     *_ended("framing", "full maze 4x4 n=800, no stars", "full maze 5x5 n=1600, no stars", limit=2 * LIMIT),
     *_timed("annealed", QUICK_MAZE),
     *_ended("annealed", "maze 6x6 n=1600", "full maze 10x10 n=400", limit=2 * LIMIT),
+    *_ended("annealed", "maze 6x6 n=10000", limit=LONGER),
     *_timed("greedy", QUICK_MAZE),
     *_ended("greedy", "maze 6x6 n=10000", "full maze 10x10 n=4000", limit=SHORT),
     *_timed("threads", QUICK_MAZE, FEW_SEEN, MACHINE, clock="wall"),
@@ -145,6 +147,7 @@ def table(results: dict[str, Any]) -> str:
         of_seeds = {trial: "" if len(found) == results["seeds"] else f", {len(found)} seeds" for trial, found in trials.items()}
         cells = [f"{trial.family}{_meant(trial)}{of_seeds[trial]}: {_spread(found)}" for trial, found in trials.items()]
         rows.append(f"| {switch} | {'<br>'.join(cells)} | {verdict(trials.values())} |")
+    rows += [f"| {switch} |  | not measured yet |" for switch in SWITCHES if switch not in ratios(results)]
     return "\n".join(rows)
 
 
@@ -170,7 +173,7 @@ minimal map is proven, or the dstates of the best map at a limit of {limits[0]:g
 
 A search that its limit ended counts as if it had ended then. ∞ stands for no map at all. The names of families are explained in `benchmarks/suite.py`: "full" is the topological
 theory, with stars where nothing else is said; other families are of the causal theory. `threads` and `processes` are about a second processor, so they are measured by
-the clock on the wall, which other work disturbs.
+the clock on the wall, on a machine that does nothing else.
 
 {table(results)}
 
