@@ -90,7 +90,7 @@ TRIALS = (
     *_timed("names", QUICK_MAZE, MACHINE_16, STARS),
     *_timed("clique", QUICK_MAZE, MACHINE_16, STARS),
     *_timed("lazy", QUICK_MAZE, MACHINE_16, CORRIDORS, STARS),
-    *_timed("core_guided", QUICK_MAZE, MACHINE_16, STARS),
+    *_timed("core_guided", QUICK_MAZE, CORRIDORS, MACHINE_16, STARS),
     *_timed("sides", STARS, TAYLOR),
     *_timed("sides", FEW_SEEN, "full maze 10x10 n=200", limit=LONGER),
     *_timed("ways", BARE_CORRIDORS, BARE.name, LARGE_BLOCK, limit=2 * LIMIT),
