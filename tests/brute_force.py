@@ -210,7 +210,9 @@ def _headings(
     def allowed(headings: tuple[int, ...]) -> bool:
         last = len(headings) - 1
         turn = actions[last - 1].turn if last else None
-        if "turn_rotates" in on and turn and headings[last] != (headings[last - 1] + QUARTERS[turn]) % 4:
+        # Headings at two places are in two frames: without turn_stays a turn may lead from one to the other.
+        stays = last and at[last - 1] == at[last]
+        if "turn_rotates" in on and turn and stays and headings[last] != (headings[last - 1] + QUARTERS[turn]) % 4:
             return False
         for i in range(last):
             if "one_heading" in on and labels[i] == labels[last] and headings[i] != headings[last]:
@@ -371,6 +373,8 @@ def _branches(places: tuple[int, ...], courses: Courses, links: frozenset[Link],
     for s, action, t in links:
         start, end = courses[s], courses[t]
         if start is None or end is None or action.turn not in ("right", "left"):
+            continue
+        if start[0] == end[0]:  # a branch is another path; without turn_changes_path a turn may lead to the same one
             continue
         (h, d), (h1, d1) = start, end
         branch = (places[s], h, d if action.turn == "right" else -d, h1, d1)
