@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -127,11 +128,12 @@ def outcome(case: Case, folder: Path, *, python: bool = False) -> Outcome:
     promised = TIME[0] * case.seconds + TIME[1]
     began = time.monotonic()
     with output.open("wb") as written, subprocess.Popen(command, stdout=written, stderr=subprocess.PIPE) as process:
-        used = None
-        while used is None:
+        ended, peak = False, 0.0
+        while not ended:
+            peak = max(peak, _peak(process.pid))
             number, status, usage = os.wait4(process.pid, os.WNOHANG)
             if number:
-                used = usage
+                ended, peak = True, peak or usage.ru_maxrss / 2**10
             else:
                 time.sleep(0.01)
                 if time.monotonic() - began > promised + GIVEN_UP:
@@ -139,7 +141,14 @@ def outcome(case: Case, folder: Path, *, python: bool = False) -> Outcome:
         taken = time.monotonic() - began
         process.returncode = os.waitstatus_to_exitcode(status)
     most = MEMORY[0] * case.mebibytes + MEMORY[1] if case.mebibytes else float("inf")
-    return Outcome(case, taken / promised, used.ru_maxrss / 2**10 / most, _status(output, process.returncode))
+    return Outcome(case, taken / promised, peak / most, _status(output, process.returncode))
+
+
+def _peak(process: int) -> float:
+    """The most MiB that a process has used so far; 0 where the system does not tell. What it tells at the end counts the process that began this one, too."""
+    with suppress(OSError, StopIteration), open(f"/proc/{process}/status", "rb") as status:
+        return next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:")) / 2**10
+    return 0.0
 
 
 def _status(output: Path, code: int) -> str:

@@ -64,8 +64,8 @@ def test_a_solution_travels_with_its_certificate(asked: bool) -> None:
     assert hash(copy.basis) == hash(solution.basis)
     assert copy.certificate == solution.certificate
     assert replace(solution, prefix=0).certificate == solution.certificate
-    assert replace(solution, evidence=None) != solution
-    assert replace(solution, evidence=None).certificate is None
+    assert replace(solution, basis=None) != solution
+    assert replace(solution, basis=None).certificate is None
 
 
 def test_a_theory_without_what_it_rests_on_has_no_certificate() -> None:

@@ -277,26 +277,21 @@ class NameReader:
 
     actions  after each step but the last, as numbers
     choices  for each step, the names that it can be at
-    rests    the names that are rests
     """
 
-    def __init__(self, actions: Sequence[int], choices: Sequence[Sequence[int]], rests: Collection[int]) -> None:
+    def __init__(self, actions: Sequence[int], choices: Sequence[Sequence[int]]) -> None:
         self._actions = actions
         self._choices = choices
-        self._rests = rests
-        self._last: dict[
-            tuple[int, int], tuple[int, int]
-        ] = {}  # where an action at a name led in the last answer, and the literal that says so
+        # Where an action at a name led in the last answer, and the literal that says so.
+        self._last: dict[tuple[int, int], tuple[int, int]] = {}
 
     def read(self, model: Model) -> dict[int, int]:
-        """The name of each step."""
+        """The name of each step, in an answer that uses no rest."""
         atoms = model.context.symbolic_atoms
         leads: dict[tuple[int, int], int] = {}
         name = next(s for s in self._choices[0] if (atom := atoms[named(0, s)]) and model.is_true(atom.literal))
         names = {0: name}
         for t, action in enumerate(self._actions, 1):
-            if name in self._rests:
-                return read_names(model)
             key = name, action
             if key not in leads:
                 there, literal = self._last.get(key, (-1, 0))

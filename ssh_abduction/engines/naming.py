@@ -457,7 +457,7 @@ class NamedLabels:
         return self._asker.answers(read, f"enum,{spares},0", 0, assumptions=[self._resting(False)], ahead=True)
 
     def _reader(self) -> facts.NameReader:
-        return facts.NameReader(self._task.log.actions[: self.size - 1], self._choices, self._rest)
+        return facts.NameReader(self._task.log.actions[: self.size - 1], self._choices)
 
     @property
     def has_all_links(self) -> bool:
