@@ -78,7 +78,7 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trac
     assert found.complete
 
 
-@pytest.mark.parametrize("seed", [0, 2, 3])
+@pytest.mark.parametrize("seed", [0, 3])
 def test_names_read_from_where_actions_lead_are_those_read_whole(seed: int) -> None:
     """Though there are no spare names at first, so that some have to be added."""
     read, answers = facts.NameReader.read, []
