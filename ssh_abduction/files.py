@@ -12,8 +12,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-DEEPEST = 100  # objects and lists within each other: Python's own functions for values fail where there are thousands of them
-LONGEST_NUMBER = 100  # digits of a whole number: longer ones cannot be made into floating-point numbers
+# So many objects and lists may be within each other: Python's own functions for values fail where there are thousands of them.
+DEEPEST = 100
+# So many digits a whole number may have: longer ones cannot be made into floating-point numbers.
+LONGEST_NUMBER = 100
 _LONG_NUMBER = re.compile(rf"\d{{{LONGEST_NUMBER + 1}}}")
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 _UNSEEN = re.compile("[\x7f-\x9f\u2028\u2029]")  # control characters that JSON need not escape, and that terminals obey

@@ -23,7 +23,8 @@ from ssh_abduction.solver.search import Search
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 from ssh_abduction.trace import Trace
 
-SHOWN = 4  # maps compared on the terminal; --json has all
+# So many maps are compared on the terminal, as more cannot be taken in there; --json has all.
+SHOWN = 4
 
 
 def add_parser(verbs: Verbs) -> None:

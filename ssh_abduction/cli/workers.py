@@ -17,8 +17,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, BinaryIO, NamedTuple
 
-STARTING = 10.0  # seconds that a process may take to begin, at most, on a machine that has much else to do
-POLL = 0.05  # seconds between looks at whether all is to stop
+# So many seconds a process may take to begin, at most, on a machine that has much else to do.
+STARTING = 10.0
+# So many seconds pass between two looks at whether all is to stop: short against the two seconds in which Ctrl-C has to be heard.
+POLL = 0.05
 
 _BEGIN = b"\0ssh-abduction answers\n"  # what is printed before, as Python begins, is no answer
 _SERVE = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from ssh_abduction.cli.workers import serve; serve()"

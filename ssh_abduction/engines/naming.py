@@ -67,7 +67,7 @@ SPARES = 2
 PATIENCE = 2000
 # So many links of a long trace clingo is given then; of others it is given all, as few are left.
 MORE_LINKS = 1000
-# After so many conflicts with all links, and where there is but one processor, a map near a guess is sought before clingo goes on.
+# After so many conflicts with all links a map near a guess is sought, if none is sought beside; then clingo goes on for as long as it takes.
 CORES = 10_000
 # So many guesses are made until one is a map, where the robot does not turn: each costs as much as the first, and few are better.
 GUESSES = 10
@@ -149,7 +149,7 @@ class NamedLabels:
         self.size = 0
         self._task, self._asker, self._given_map, self._fitting = task, asker, given_map, fitting
         self._hard = False  # whether few conflicts were not enough
-        self._searched_alone = False  # whether small maps were sought with nothing beside
+        self._had_all_help = False  # whether all links were given, and small maps were sought by other means, too
         self._seeking = False  # whether the fewest dstates are being sought
         self._beside: Beside | None = None  # a search for a map near a guess, in another thread
         self._forbidden: list[list[tuple[int, int]]] = []  # sets of pairs of steps, of each of which some pair is not one dstate
@@ -190,7 +190,7 @@ class NamedLabels:
         self.clique = self.chart.continuations.clique() if self._task.speedups.clique else [0]
         self._asker.watch.check()
         self._may_be = _may_be(self.chart, self.clique)
-        self._hard = self._searched_alone = False
+        self._hard = self._had_all_help = False
         self.known = numbered(self._given_map[:size]) or None
         self._spares = self._first_spares()
         self._links = dict.fromkeys(self.chart.links)
@@ -269,16 +269,17 @@ class NamedLabels:
         """After how many conflicts something else is done; -1 for never."""
         if not self.has_all_links:
             return PATIENCE
-        return -1 if self._searched_alone or self._task.has_processors or not self._may_search_nearby else CORES
+        return -1 if self._had_all_help or not self._may_search_nearby else CORES
 
     def _helped(self) -> Iterator[list[int]]:
         """Labels of small maps, by other means than clingo's search for the fewest dstates, which takes long."""
         if self._may_search_nearby and not self._hard:
             yield from self._search_nearby()
         self._hard = True
-        if self.has_all_links and self._may_search_nearby and not self._searched_alone and not self._task.has_processors:
-            self._searched_alone = True
-            yield from self._search_alone()
+        if self.has_all_links and self._may_search_nearby and not self._had_all_help:
+            self._had_all_help = True
+            if not self._task.has_processors:
+                yield from self._search_alone()
 
     def _cheapest(self, conflicts: int) -> tuple[dict[int, int] | None, bool]:
         """The best answer that clingo finds with so many conflicts, and whether it is proven to be the best."""

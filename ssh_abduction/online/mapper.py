@@ -61,12 +61,18 @@ from ssh_abduction.trace import Action, Step, Trace, View
 if TYPE_CHECKING:
     from ssh_abduction.online.background import MapGuess
 
-RETRY = 1.01  # after a search that was stopped, the trace grows by this factor before the next, so that few steps are slow,
-PAUSE = 2  # and by so many steps at least
-DRAFTS = 3  # maps of fewer steps that go on like sketches, at most
-GUESSED = 100  # steps from which on maps are guessed
-MENDING = 5e-7  # seconds that it takes to mend a map, about, by the square of the number of steps
-GUESS_AGAIN = 1.05  # the trace grows by this factor before the next guess
+# After a search that was stopped the trace grows by this factor before the next one, so that few steps are slow.
+RETRY = 1.01
+# And it grows by so many steps at least.
+PAUSE = 2
+# So many maps of fewer steps go on like sketches, at most: each takes its time at every step, and mostly one of the first goes on for long.
+DRAFTS = 3
+# From so many steps on maps are guessed; before, clingo is in time.
+GUESSED = 100
+# So many seconds it takes to mend a map, about, times the square of the number of steps, before it was measured here.
+MENDING = 5e-7
+# The trace grows by this factor before the next guess, which takes seconds, and is not much better for few steps more.
+GUESS_AGAIN = 1.05
 
 
 class OnlineMapper:

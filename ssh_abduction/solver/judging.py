@@ -16,12 +16,16 @@ from ssh_abduction.theory.evidence import Equality, evidence_of
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
-SHARE = 0.1  # of the time of the search, at most, is spent on checking what is not checked always
-ALWAYS = 3  # maps that are checked however long that takes, by a prefix at least
-SAMPLE = 1000  # steps beyond the prefix that are looked at where there is no time for all of them
-UNSHOWN = frozenset(
-    {"one_place", "one_course", "one_heading"}
-)  # without these a map shows one of several places, courses or headings of a dstate
+# At most such a share of the time of the search is spent on checking what is not checked always.
+SHARE = 0.1
+# So many maps are checked however long that takes, by the steps that clingo was given at least.
+ALWAYS = 3
+# So many steps beyond these are looked at where there is no time for all of them.
+SAMPLE = 1000
+# So many seconds the checker takes for a step, about, before the first check has shown it.
+A_STEP = 5e-6
+# Without these axioms a map shows one of several places, courses or headings of a dstate, so that the checker cannot judge it.
+UNSHOWN = frozenset({"one_place", "one_course", "one_heading"})
 
 
 class InternalError(SolverError):
@@ -41,7 +45,7 @@ class Judging:
         self._evidence = evidence_of(theory)
         self._judged = 0
         self._seconds = 0.0  # spent so far
-        self._a_step = 0.0  # seconds that a step takes, by the last check
+        self._a_step = A_STEP  # seconds that a step takes, by the last check
         self._shown = not UNSHOWN & theory.given_up
 
     def why_refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
