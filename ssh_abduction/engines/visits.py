@@ -151,7 +151,8 @@ class VisitLabels:
                 chart = self._charted(size, None)
                 if chart is None:
                     return False
-                self._give(chart, self._first_visits(chart), self._order_of_choice(chart), anew=True)
+                order = self._order_of_choice(chart)  # which finds the clique, whose visits are among the first
+                self._give(chart, self._first_visits(chart), order, anew=True)
             self.size = size
             self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
             self.known = None
