@@ -43,6 +43,7 @@ class Judging:
         self._trace = trace
         self._theory = theory
         self._evidence = evidence_of(theory)
+        self._accepted: SSHMap | None = None  # the last map that passed the checker before it was kept
         self._judged = 0
         self._seconds = 0.0  # spent so far
         self._a_step = A_STEP  # seconds that a step takes, by the last check
@@ -54,7 +55,9 @@ class Judging:
 
     def accepts(self, ssh_map: SSHMap) -> bool:
         """Whether a map of the whole trace that nothing proves yet is known to satisfy all axioms."""
-        return not unchecked(self._theory) and not check(self._trace, ssh_map, self._theory) and not self.why_refused(ssh_map)
+        accepted = not unchecked(self._theory) and not check(self._trace, ssh_map, self._theory) and not self.why_refused(ssh_map)
+        self._accepted = ssh_map if accepted else self._accepted
+        return accepted
 
     def pass_map(self, ssh_map: SSHMap, prefix: int, elapsed: float) -> None:
         """Raise InternalError where a map of the whole trace breaks an axiom, as far as there is time to look.
@@ -62,10 +65,11 @@ class Judging:
         prefix   how many of the first steps clingo was given
         elapsed  seconds that the search took so far
         """
-        if not self._shown:
+        if not self._shown or ssh_map == self._accepted:
             return
         steps = len(self._trace)
-        if self.has_time_for(steps, elapsed) or (self._judged < ALWAYS and steps <= prefix):
+        shows_all = prefix < steps and len(set(ssh_map.labels[:prefix])) == len(ssh_map.dstates)
+        if self.has_time_for(steps, elapsed) or (self._judged < ALWAYS and not shows_all):
             self._check(ssh_map, steps)
         elif self._judged < ALWAYS:
             self._check(_of_first_steps(ssh_map, prefix), prefix)
