@@ -64,7 +64,7 @@ from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Trace, checked_trace
 
-FEW_STEPS = 24  # Traces up to this length skip names, greedy maps and bounds from below: solving them directly is faster.
+FEW_STEPS = 24  # Traces up to this length skip names and greedy maps: solving them directly is faster.
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.
 ONE_MORE_SHARE = 0.1  # Or for such a share of the time that these took, if that is more, so that it is never a large part of the search.
 FRAME_AFTER = 1.0  # After so many seconds step by step a map with frames is sought, where the theory does not ask for one: most traces are solved by then.
