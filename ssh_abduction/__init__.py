@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from ssh_abduction.engines.base import Cost
     from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
     from ssh_abduction.maps import DState, Path, SSHMap
+    from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
     from ssh_abduction.solver.result import Bound, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
@@ -25,6 +26,7 @@ _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
     "errors": ("MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "maps": ("DState", "Path", "SSHMap"),
+    "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
     "solver.result": ("Bound", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
@@ -41,6 +43,7 @@ __all__ = [
     "Cost",
     "DState",
     "MapError",
+    "Odometry",
     "OnlineMapper",
     "Path",
     "Progress",
