@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from ssh_abduction.engines.base import Cost
     from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
+    from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
     from ssh_abduction.maps import DState, Path, SSHMap
     from ssh_abduction.online.mapper import OnlineMapper
     from ssh_abduction.solver.result import Bound, Progress, Solution, Status
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
     "errors": ("MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
+    "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
     "maps": ("DState", "Path", "SSHMap"),
     "online.mapper": ("OnlineMapper",),
     "solver.result": ("Bound", "Progress", "Solution", "Status"),
@@ -40,7 +42,9 @@ __all__ = [
     "Certificate",
     "Cost",
     "DState",
+    "Evaluation",
     "MapError",
+    "MapEvaluation",
     "OnlineMapper",
     "Path",
     "Progress",
@@ -56,6 +60,7 @@ __all__ = [
     "TheoryError",
     "Trace",
     "TraceError",
+    "evaluate",
     "solve",
 ]
 
