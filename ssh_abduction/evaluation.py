@@ -243,10 +243,10 @@ class _Sort:
 
     @property
     def right(self) -> bool | None:
-        """Whether both tell the same steps apart; None where one of them tells nothing."""
+        """Whether both tell the same steps apart; None where one of them tells nothing. A step that the map has at none makes a pair too many."""
         if not self.of_map:
             return None
-        return len(self.steps) == len(self.of_map) == len(self.of_truth) and all(x is not None for x, _ in self.steps)
+        return len(self.steps) == len(self.of_map) == len(self.of_truth)
 
     @property
     def count(self) -> int | None:

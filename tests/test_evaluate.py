@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations, permutations
+from itertools import combinations, pairwise, permutations
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +28,9 @@ def told(trace: Trace, truths: Sequence[Any]) -> Trace:
     return replace(trace, steps=tuple(replace(step, truth=truth) for step, truth in zip(trace.steps, truths, strict=True)))
 
 
-def walk(truths: Sequence[Any], kind: str = "travel") -> Trace:
+def walk(truths: Sequence[Any]) -> Trace:
     """A trace in which nothing is seen but that the robot travels, with this truth."""
-    return told(Trace.from_steps("v" * len(truths), [{"name": "go", "kind": kind}] * (len(truths) - 1)), truths)
+    return told(Trace.from_steps("v" * len(truths), [{"name": "go", "kind": "travel"}] * (len(truths) - 1)), truths)
 
 
 def labelled(
@@ -64,6 +64,22 @@ def naive_accuracy(labels: Sequence[int], truths: Sequence[Any]) -> float | None
     return share(best, len(known))
 
 
+def naive_edges(said: Sequence[int], true: Sequence[int]) -> set[tuple[float | None, float | None]]:
+    """Precision and recall of edges under each of the one-to-one assignments that fit most steps."""
+    own = sorted(set(said))
+    spare = [*sorted(set(true)), *(-1 - x for x in own)]  # a negative place is none
+    assignments = [dict(zip(own, assigned, strict=True)) for assigned in permutations(spare, len(own))]
+    fits = [sum(assigned[x] == y for x, y in zip(said, true, strict=True)) for assigned in assignments]
+    edges = {frozenset(edge) for edge in pairwise(said)}
+    true_edges = {frozenset(edge) for edge in pairwise(true)}
+    found = set()
+    for assigned, fit in zip(assignments, fits, strict=True):
+        if fit == max(fits):
+            right = len({frozenset(assigned[x] for x in edge) for edge in edges} & true_edges)
+            found.add((share(right, len(edges)), share(right, len(true_edges))))
+    return found
+
+
 def naive_pairs(said: Sequence[int], true: Sequence[Any]) -> tuple[float | None, float | None]:
     both = of_map = of_truth = 0
     for i, j in combinations(range(len(said)), 2):
@@ -91,6 +107,15 @@ def test_accuracy_and_pairs_are_those_that_are_counted_naively(seed: int) -> Non
     known = [(x, y) for x, y in zip(labels, names, strict=True) if y is not None]
     assert found.dstates_right == all((a == b) == (c == d) for (a, c), (b, d) in combinations(known, 2))
     assert found.dstates == len({x for x, _ in known})
+
+
+@pytest.mark.parametrize("seed", range(15))
+def test_edges_are_those_of_a_best_assignment(seed: int) -> None:
+    rng = random.Random(seed)
+    said = [*(rng.randrange(4) for _ in range(10)), 3]
+    true = [x if rng.random() < 0.6 else rng.randrange(4) for x in said]
+    found = one(labelled(said, range(4)), walk([{"place": place} for place in true]))
+    assert (found.edge_precision, found.edge_recall) in naive_edges(said, true)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -167,13 +192,18 @@ def test_edges_are_counted_by_hand() -> None:
     trace = walk([{"place": p} for p in "ABCABA"])
     found = one(labelled([0, 1, 0, 0, 1, 0], [0, 1]), trace)
     assert (found.edge_precision, found.edge_recall) == (1 / 2, 1 / 3)
-    turning = walk([{"place": p} for p in "AABB"], kind="travel")
-    steps = tuple(
-        replace(s, action=Trace.from_steps("vv", ["right"]).actions[0]) if t != 1 and s.action else s for t, s in enumerate(turning.steps)
-    )
-    found = one(labelled([0, 1, 2, 3], [0, 0, 1, 1]), replace(turning, steps=steps))
-    assert (found.edge_precision, found.edge_recall) == (1, 1)  # turns are no edges
     assert found.link_precision is None  # the truth names no dstates
+
+
+def test_turns_are_no_edges() -> None:
+    trace = told(Trace.from_steps("vvvv", ["right", "travel", "left"]), [{"place": p} for p in "AABB"])
+    found = one(labelled([0, 1, 2, 3], [0, 0, 0, 0]), trace)
+    assert (found.edge_precision, found.edge_recall) == (0, 0)  # the turns alone are right
+
+
+def test_steps_without_a_place_are_not_at_one_place() -> None:
+    found = one(labelled([0, 0, 1, 1], [0, None]), walk([{"place": p} for p in "AABB"]))
+    assert (found.place_precision, found.place_recall, found.places_right) == (1, 1 / 2, False)
 
 
 def test_links_without_truth_at_an_end_are_left_out() -> None:
