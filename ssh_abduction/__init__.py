@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
     from ssh_abduction.maps import DState, Path, SSHMap
+    from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
     from ssh_abduction.solver.result import Bound, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
@@ -27,6 +28,7 @@ _HOMES = {  # module: the names that it exports
     "errors": ("MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
     "maps": ("DState", "Path", "SSHMap"),
+    "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
     "solver.result": ("Bound", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
@@ -45,6 +47,7 @@ __all__ = [
     "Evaluation",
     "MapError",
     "MapEvaluation",
+    "Odometry",
     "OnlineMapper",
     "Path",
     "Progress",

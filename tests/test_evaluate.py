@@ -305,12 +305,12 @@ def test_maps_that_cannot_be_used() -> None:
 
 
 def test_it_loads_nothing_that_infers() -> None:
-    program = "import sys, ssh_abduction.evaluation; print(sorted(m for m in sys.modules if m.startswith(('clingo', 'ssh_abduction.'))))"
+    program = "import sys, ssh_abduction.evaluation; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert (
-        done.stdout
-        == "['ssh_abduction.errors', 'ssh_abduction.evaluation', 'ssh_abduction.files', 'ssh_abduction.maps', 'ssh_abduction.trace']\n"
-    )
+    loaded = {".".join(name.split(".")[:2]) for name in done.stdout.split()}
+    assert "ssh_abduction.evaluation" in loaded
+    rooms = ("learner", "online", "solver", "engines", "asp", "guesses", "steps", "judge", "theory")
+    assert not loaded & {"clingo", *(f"ssh_abduction.{room}" for room in rooms)}
 
 
 # The shell
