@@ -52,10 +52,12 @@ class Displacement:
     returns: int
     has_places: bool
     turns_stay: bool
+    has_one_view: bool
 
     @classmethod
     def of(cls, theory: Theory) -> Displacement:
-        return cls(theory.reject, theory.joint, theory.returns, theory.level == "topological", "turn_stays" in theory.hard)
+        topological, hard = theory.level == "topological", theory.hard
+        return cls(theory.reject, theory.joint, theory.returns, topological, "turn_stays" in hard, "functional_view" in hard)
 
     def pairs(self, trace: Trace) -> Pairs:
         return self._of(trace).pairs
@@ -108,7 +110,7 @@ class Returns:
         """The returns of places, and those of dstates, about which displacements say something: their first steps, and their last ones."""
         views: dict[object, list[int]] = defaultdict(list)
         for t, step in enumerate(self._trace.steps):
-            views[step.view].append(t)
+            views[step.view if self._evidence.has_one_view else None].append(t)
         return {True: self._loops_within([self.arrivals] if self._evidence.has_places else []), False: self._loops_within(list(views.values()))}
 
     def _loops_within(self, groups: Sequence[Sequence[int]]) -> tuple[Steps, Steps]:
