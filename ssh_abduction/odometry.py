@@ -55,7 +55,9 @@ class Odometry:
         for name in NUMBERS:
             value = getattr(self, name)
             if not is_finite(value) or not 0 <= value <= FARTHEST:
-                raise TraceError(f"odometry.{name}: expected a number from 0 to {FARTHEST:.0f}, got {brief(value)}; give a standard deviation")
+                raise TraceError(
+                    f"odometry.{name}: expected a number from 0 to {FARTHEST:.0f}, got {brief(value)}; give a standard deviation"
+                )
             object.__setattr__(self, name, float(value))
 
     @classmethod

@@ -271,7 +271,9 @@ class Trace:
             raise TraceError(
                 f"trace: expected a star a view, got {len(openings)} stars and {len(seen)} views; give None where none was seen"
             )
-        moved, noise = (_of_actions(values, what, len(done)) for values, what in ((displacements, "displacements"), (covariances, "covariances")))
+        moved, noise = (
+            _of_actions(values, what, len(done)) for values, what in ((displacements, "displacements"), (covariances, "covariances"))
+        )
         steps = tuple(
             Step.of(view, star, f"step {i}", done[i] if i < len(done) else None, moved[i], noise[i])
             for i, (view, star) in enumerate(zip(seen, openings, strict=True))
@@ -466,7 +468,9 @@ def _of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[A
     """For each step, what belongs to the action that led to it, from one value for each action."""
     listed = [None] * actions if values is None else _listed(values, name)
     if len(listed) != actions:
-        raise TraceError(f"trace: expected one of {name} for each action, got {len(listed)} and {actions} actions; give None where one is not known")
+        raise TraceError(
+            f"trace: expected one of {name} for each action, got {len(listed)} and {actions} actions; give None where one is not known"
+        )
     return [None, *listed]
 
 

@@ -112,7 +112,10 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "star of texts": ([HEADER, '{"view": "a", "star": ["n"]}'], "2: star[0]: expected a finite number"),
     "star with equal bearings": ([HEADER, '{"view": "a", "star": [10, 370]}'], "2: star: expected four 0/1"),
-    "displacement in millimetres": ([HEADER, '{"view": "a", "displacement": [5000, 0, 0]}'], "2: displacement: expected metres, at most 1,000"),
+    "displacement in millimetres": (
+        [HEADER, '{"view": "a", "displacement": [5000, 0, 0]}'],
+        "2: displacement: expected metres, at most 1,000",
+    ),
     "displacement in degrees": ([HEADER, '{"view": "a", "displacement": [5, 0, 90]}'], "2: displacement[2]: expected radians"),
     "covariance without displacement": (
         [HEADER, '{"view": "a", "covariance": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}'],
@@ -135,7 +138,10 @@ BAD: dict[str, tuple[list[str], str]] = {
         "2: covariance[1][1]: expected a finite number",
     ),
     "odometry no object": (['{"format": "ssh-trace", "version": 1, "odometry": 3}'], "1: odometry: expected an object"),
-    "odometry negative": (['{"format": "ssh-trace", "version": 1, "odometry": {"along": -1}}'], "1: odometry.along: expected a number from 0"),
+    "odometry negative": (
+        ['{"format": "ssh-trace", "version": 1, "odometry": {"along": -1}}'],
+        "1: odometry.along: expected a number from 0",
+    ),
     "displacement of two": ([HEADER, '{"view": "a", "displacement": [1, 2]}'], "2: displacement: expected [dx, dy, dtheta]"),
     "negative index": ([HEADER, '{"image": -1}'], "2: image: expected an index"),
     "broken JSON": ([HEADER, STEP, '{"view": "b"'], "3: line: expected one JSON object, got broken JSON at column 13"),
