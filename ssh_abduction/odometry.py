@@ -119,13 +119,13 @@ def checked_covariance(value: Any, where: str) -> Covariance:
         for j, x in enumerate(row):
             if not is_finite(x):
                 raise TraceError(f"{where}[{i}][{j}]: expected a finite number, got {brief(x)}; replace it, or leave the field out")
-    (a, b, c), (d, e, f), (g, h, i) = (tuple(map(float, row)) for row in rows)
-    largest = max(abs(x) for x in (a, b, c, d, e, f, g, h, i))
+    (a, b, c), (d, e, f), (g, h, k) = (tuple(map(float, row)) for row in rows)
+    largest = max(abs(x) for x in (a, b, c, d, e, f, g, h, k))
     if max(abs(b - d), abs(c - g), abs(f - h)) > SYMMETRIC * largest:
         raise TraceError(f"{where}: expected a symmetric matrix, got {brief(value)}; mend the entries that differ")
-    minors = a, a * e - b * b, a * (e * i - f * f) - b * (b * i - f * c) + c * (b * f - e * c)
+    minors = a, a * e - b * b, a * (e * k - f * f) - b * (b * k - f * c) + c * (b * f - e * c)
     if not all(minor > 0 for minor in minors) or not all(map(math.isfinite, minors)):
         raise TraceError(
             f"{where}: expected a positive definite matrix, got {brief(value)}; give variances above 0, in square metres and square radians"
         )
-    return (a, b, c), (b, e, f), (c, f, i)
+    return (a, b, c), (b, e, f), (c, f, k)
