@@ -84,9 +84,9 @@ def _evidence_facts(trace: Trace, theory: Theory, start: int, stop: int) -> Iter
     for evidence in evidence_of(theory):
         pairs = evidence.pairs(trace)
         for t in range(start, stop) if pairs else ():
-            yield from (f"excluded({evidence.name},{i},{t})." for i in pairs.apart.get(t, ()))
+            yield from (f"excluded({evidence.axiom},{i},{t})." for i in pairs.apart.get(t, ()))
             if theory.level == "topological":
-                yield from (f"elsewhere({evidence.name},{i},{t})." for i in pairs.elsewhere.get(t, ()))
+                yield from (f"elsewhere({evidence.axiom},{i},{t})." for i in pairs.elsewhere.get(t, ()))
             yield from (f"one({i},{t})." for i in pairs.one.get(t, ()))
         yield evidence.facts(trace, start, stop)
 
