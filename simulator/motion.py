@@ -16,6 +16,8 @@ import numpy as np
 from ssh_abduction.odometry import Displacement, Odometry
 
 Pose = tuple[float, float, float]
+# What is reported is rounded to so many digits after the point, as in a log.
+DIGITS = 5
 
 
 def moved(pose: Pose, displacement: Displacement) -> Pose:
@@ -46,4 +48,4 @@ def reported(
     cos, sin = (1 + scale) * math.cos(drift / 2), (1 + scale) * math.sin(drift / 2)  # on the average the way is half of the drift off
     noise = np.linalg.cholesky(np.array(odometry.covariance(displacement))) @ rng.normal(size=3)
     x, y, heading = np.array([cos * dx - sin * dy, sin * dx + cos * dy, turned + drift]) + noise
-    return float(x), float(y), float(heading)
+    return round(float(x), DIGITS), round(float(y), DIGITS), round(float(heading), DIGITS)

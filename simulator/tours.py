@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from simulator.control import STILL, Driver, Tolerance, act, climb
 from simulator.errors import SimulatorError
 from simulator.laser import Laser
+from simulator.motion import DIGITS
 from simulator.robot import Body, Report, Robot
 from simulator.world import World
 from ssh_abduction.odometry import Displacement, Odometry
@@ -104,7 +105,7 @@ class Log:
             self.begun = True
             return None
         self.reports.append(report)
-        dx, dy, turned = (round(v, 5) for v in report.displacement)
+        dx, dy, turned = (round(v, DIGITS) for v in report.displacement)
         return dx, dy, turned
 
 
