@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from ssh_abduction.engines.base import Cost
     from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
+    from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
     from ssh_abduction.maps import DState, Path, SSHMap
     from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
     "errors": ("MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
+    "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
     "maps": ("DState", "Path", "SSHMap"),
     "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
@@ -42,7 +44,9 @@ __all__ = [
     "Certificate",
     "Cost",
     "DState",
+    "Evaluation",
     "MapError",
+    "MapEvaluation",
     "Odometry",
     "OnlineMapper",
     "Path",
@@ -59,6 +63,7 @@ __all__ = [
     "TheoryError",
     "Trace",
     "TraceError",
+    "evaluate",
     "solve",
 ]
 

@@ -96,7 +96,11 @@ def traces(draw: st.DrawFn, max_steps: int = 7) -> Trace:
 
 def _usual(action: Action) -> tuple[float, float, float]:
     """What an action does in a world of squares, 10 metres wide."""
-    return (10.0, 0.0, 0.0) if action.kind != "turn" else (0.0, 0.0, {"right": -math.pi / 2, "left": math.pi / 2}.get(action.turn or "", math.pi))
+    return (
+        (10.0, 0.0, 0.0)
+        if action.kind != "turn"
+        else (0.0, 0.0, {"right": -math.pi / 2, "left": math.pi / 2}.get(action.turn or "", math.pi))
+    )
 
 
 def _seldom(values: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:

@@ -818,7 +818,10 @@ def _one_pose(m: _Reading) -> Found:
     for refused in refused_returns(m.trace, m.map, m.theory):
         said = " and ".join(f"steps {i} and {j} are at one {'place' if freedom == 2 else 'dstate'}" for i, j, freedom in refused.returns)
         steps = [t for i, j, _ in refused.returns for t in (i, j)]
-        yield steps, f"By the displacements it cannot be that {said}: chi-square {refused.square:.0f}, and at most {refused.most:.0f} is allowed."
+        yield (
+            steps,
+            f"By the displacements it cannot be that {said}: chi-square {refused.square:.0f}, and at most {refused.most:.0f} is allowed.",
+        )
 
 
 AXIOMS: dict[str, Check] = {

@@ -225,7 +225,9 @@ def _square_together(filtered: _Filter, rows: NDArray[np.int_], a: int, others: 
     begin, end = np.maximum(rows[others, 0], rows[a, 0]), np.minimum(rows[others, 1], rows[a, 1])
     common = filtered.since(begin, end)
     mixed = filtered.onward(end, rows[here, 1]) @ common @ filtered.onward(end, rows[others, 1]).swapaxes(1, 2)
-    mixed += filtered.repeated_since(rows[here, 0], rows[here, 1]) @ filtered.repeated_since(rows[others, 0], rows[others, 1]).swapaxes(1, 2)
+    mixed += filtered.repeated_since(rows[here, 0], rows[here, 1]) @ filtered.repeated_since(rows[others, 0], rows[others, 1]).swapaxes(
+        1, 2
+    )
     joint, off = np.zeros((m, 6, 6)), np.zeros((m, 6))
     for k, which in enumerate((here, others)):
         part = slice(3 * k, 3 * k + 3)
@@ -238,7 +240,8 @@ def _square_together(filtered: _Filter, rows: NDArray[np.int_], a: int, others: 
         joint[free, 3 * k + 2, :] = joint[free, :, 3 * k + 2] = 0.0
         joint[free, 3 * k + 2, 3 * k + 2] = 1.0
     known = filtered.is_known(rows[here, 0], rows[here, 1]) & filtered.is_known(rows[others, 0], rows[others, 1])
-    return np.where(known, _square(off, joint), 0.0)
+    square: Array = np.where(known, _square(off, joint), 0.0)
+    return square
 
 
 def _square(off: Array, covariance: Array) -> Array:

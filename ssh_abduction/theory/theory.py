@@ -129,7 +129,9 @@ class Theory:
 
     def _check_numbers(self) -> None:
         if not is_finite(self.reject) or not 0 < self.reject < 1:
-            raise TheoryError(f"reject: expected a probability above 0 and below 1, got {brief(self.reject)}; take 0.001, or another small one")
+            raise TheoryError(
+                f"reject: expected a probability above 0 and below 1, got {brief(self.reject)}; take 0.001, or another small one"
+            )
         for name, least, most in (("joint", 1, MOST_JOINT), ("returns", 0, MOST_STEPS)):
             value = getattr(self, name)
             if not is_whole(value) or not least <= value <= most:
@@ -251,7 +253,9 @@ class Theory:
         displacement = self.displacement
         if displacement == "auto":
             displacement = "use" if trace.has_displacements else "none"
-        if displacement == "use" and not trace.has_displacements and not self.returns:  # once they are counted, this may be a part of a trace
+        if (
+            displacement == "use" and not trace.has_displacements and not self.returns
+        ):  # once they are counted, this may be a part of a trace
             mend = f"add them to the steps, or take {_choice('displacement', 'none')}"
             raise TheoryError(f"displacement: expected a trace with displacements for displacement=use, got none; {mend}")
         theory = replace(self, star=star, displacement=displacement)

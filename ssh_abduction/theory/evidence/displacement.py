@@ -17,10 +17,10 @@ so until there are twice as many.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 from ssh_abduction.maps import SSHMap
@@ -52,10 +52,12 @@ class Displacement:
     returns: int
     has_places: bool
     turns_stay: bool
+    has_one_view: bool
 
     @classmethod
     def of(cls, theory: Theory) -> Displacement:
-        return cls(theory.reject, theory.joint, theory.returns, theory.level == "topological", "turn_stays" in theory.hard)
+        topological, hard = theory.level == "topological", theory.hard
+        return cls(theory.reject, theory.joint, theory.returns, topological, "turn_stays" in hard, "functional_view" in hard)
 
     def pairs(self, trace: Trace) -> Pairs:
         return self._of(trace).pairs
@@ -70,10 +72,16 @@ class Displacement:
         return _returns(self, trace)
 
 
-@lru_cache(maxsize=4)
+_KEPT: deque[Returns] = deque(maxlen=4)  # the returns that were asked for last, as several parts of a search ask for them
+
+
 def _returns(evidence: Displacement, trace: Trace) -> Returns:
-    """The returns of a trace. They are kept, as several parts of a search ask for them."""
-    return Returns(evidence, trace)
+    """The returns of a trace, made when they are first asked for."""
+    for known in list(_KEPT):
+        if known.trace is trace and known.evidence == evidence:
+            return known
+    _KEPT.append(found := Returns(evidence, trace))
+    return found
 
 
 def count_returns(trace: Trace, theory: Theory) -> int:
@@ -85,13 +93,13 @@ class Returns:
     """The returns that a trace may have, and which of them are refused."""
 
     def __init__(self, evidence: Displacement, trace: Trace) -> None:
-        self._evidence, self._trace = evidence, trace
+        self.evidence, self.trace = evidence, trace
         self._accepted: frozenset[Return] = frozenset()  # no two of these are refused together
 
     @cached_property
     def pairs(self) -> Pairs:
         """The pairs of steps that are not at one place, or not one dstate."""
-        if not self._trace.has_displacements:
+        if not self.trace.has_displacements:
             return NO_PAIRS
         far = [self._refused_at(places=True), self._refused_at(places=False)]
         elsewhere = [(int(i), int(j)) for i, j in zip(*far[0], strict=True)]
@@ -101,15 +109,18 @@ class Returns:
     @cached_property
     def arrivals(self) -> list[int]:
         """The first step of each visit: where the robot came to a place. Where it is not known which actions are turns, each step is a visit."""
-        return [0, *(t for t, action in enumerate(self._trace.actions, 1) if action.kind != "turn")]
+        return [0, *(t for t, action in enumerate(self.trace.actions, 1) if action.kind != "turn")]
 
     @cached_property
     def tested(self) -> dict[bool, tuple[Steps, Steps]]:
         """The returns of places, and those of dstates, about which displacements say something: their first steps, and their last ones."""
         views: dict[object, list[int]] = defaultdict(list)
-        for t, step in enumerate(self._trace.steps):
-            views[step.view].append(t)
-        return {True: self._loops_within([self.arrivals] if self._evidence.has_places else []), False: self._loops_within(list(views.values()))}
+        for t, step in enumerate(self.trace.steps):
+            views[step.view if self.evidence.has_one_view else None].append(t)
+        return {
+            True: self._loops_within([self.arrivals] if self.evidence.has_places else []),
+            False: self._loops_within(list(views.values())),
+        }
 
     def _loops_within(self, groups: Sequence[Sequence[int]]) -> tuple[Steps, Steps]:
         """All loops between two steps of one group about which displacements say something."""
@@ -131,7 +142,7 @@ class Returns:
     def _bends(self) -> list[tuple[Loops, float]]:
         from ssh_abduction.theory.loops import bends  # loads numpy
 
-        return list(bends(self._trace))
+        return list(bends(self.trace))
 
     @property
     def _widest(self) -> Loops:
@@ -144,7 +155,7 @@ class Returns:
 
         from ssh_abduction.theory.loops import Loops, chi_squares
 
-        loops, likely = Loops.of(self._trace), 0
+        loops, likely = Loops.of(self.trace), 0
         for places, (first, last) in self.tested.items():
             half = 2 * gammainccinv((2 if places else 3) / 2, 0.5)
             for part in _parts(len(first)):
@@ -159,8 +170,8 @@ class Returns:
         """
         from scipy.special import gammainccinv
 
-        share = self._evidence.reject / (2 if self._evidence.joint > 1 else 1)
-        returns = max(self._evidence.returns, 1)
+        share = self.evidence.reject / (2 if self.evidence.joint > 1 else 1)
+        returns = max(self.evidence.returns, 1)
         tests = returns * (returns - 1) / 2 if together else returns
         return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
@@ -194,13 +205,13 @@ class Returns:
 
     def _steps_of_visits(self, elsewhere: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
         """The pairs of steps that show the same view, in visits that are not at one place. Steps that show different views are apart anyway."""
-        if not self._evidence.turns_stay:
+        if not self.evidence.turns_stay:
             return
         shown: dict[int, dict[object, list[int]]] = {}
-        for here, there in zip(self.arrivals, [*self.arrivals[1:], len(self._trace)], strict=True):
+        for here, there in zip(self.arrivals, [*self.arrivals[1:], len(self.trace)], strict=True):
             by_view = shown[here] = defaultdict(list)
             for t in range(here, there):
-                by_view[self._trace.steps[t].view].append(t)
+                by_view[self.trace.steps[t].view].append(t)
         for i, j in elsewhere:
             for view, steps in shown[i].items():
                 if others := shown[j].get(view):
@@ -225,7 +236,7 @@ class Returns:
 
     def refused_together(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
         """The two returns of a map that are refused together most clearly; None where no two are."""
-        if not self._trace.has_displacements:
+        if not self.trace.has_displacements:
             return None
         returns = frozenset(self.returns_of(ssh_map))
         worst = self._worst_of(sorted(returns - self._accepted), sorted(returns & self._accepted))
