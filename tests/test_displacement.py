@@ -49,7 +49,7 @@ def circuit(
     return Trace.from_steps(views, ["travel", "right"] * sides, displacements=moved, odometry=odometry)
 
 
-@settings(max_examples=120, deadline=None, derandomize=True)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.data())
 def test_solver_and_checker_agree_with_matrices_written_out(data: st.DataObject) -> None:
     trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")
@@ -57,7 +57,7 @@ def test_solver_and_checker_agree_with_matrices_written_out(data: st.DataObject)
     agree(trace, theory)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=20, deadline=None, derandomize=True)
 @given(st.integers(0, 10_000), st.integers(3, 6), st.sampled_from([1.0, 2.0, 3.0]), st.sampled_from([0.0, 0.01]))
 def test_sets_of_two_are_those_of_matrices_written_out(seed: int, corners: int, noise: float, bend: float) -> None:
     """Labels that need not be a map's: every second step is at one of few dstates, so that many returns share displacements."""
@@ -82,24 +82,7 @@ def test_sets_of_two_are_those_of_matrices_written_out(seed: int, corners: int, 
     }
 
 
-def test_sets_of_two_are_refused_though_each_return_may_be_true() -> None:
-    """The way out is 4 m short by one return and 4 m long by the other, which is likely enough for each of them, and not for both."""
-    moved = [(10.0, 0.0, 0.0), (0.0, 0.0, math.pi), (12.0, 0.0, 0.0), (0.0, 0.0, math.pi), (8.0, 0.0, 0.0)]
-    odometry = Odometry(along=0.05, across=0.01, heading=0.001, turning=0.0, position=0.01, angle=0.001, scale=0.0, bend=0.0)
-    trace = Trace.from_steps("abcdef", ["travel", "around", "travel", "around", "travel"], displacements=moved, odometry=odometry)
-    theory = Theory.topological().replace(reject=0.02).resolve(trace)
-    returns, written_out = Returns(Displacement.of(theory), trace), Geometry(trace, theory)
-    found = [
-        ((0, 3, 2), (1, 5, 2)),
-    ]
-    for pair in found:
-        assert not any(written_out.refuses((one,)) for one in pair)
-    assert returns.threshold(4, together=True) > returns.threshold(2, together=False)
-
-
-@settings(max_examples=40, deadline=None, derandomize=True)
-@given(st.integers(0, 1000))
-def test_covariances_of_closings_are_those_of_many_noisy_drives(seed: int) -> None:
+def test_covariances_of_closings_are_those_of_many_noisy_drives() -> None:
     """To first order: the noise is a hundredth of what the covariance is for."""
     odometry = Odometry(along=0.05, across=0.03, heading=0.004, turning=0.02, position=0.1, angle=0.02, scale=0.0, bend=0.0)
     little = Odometry(
@@ -107,12 +90,16 @@ def test_covariances_of_closings_are_those_of_many_noisy_drives(seed: int) -> No
         scale=0.0,
         bend=0.0,
     )
-    if seed:
-        return
-    ends = []
-    for drive in range(400):
-        loops = Loops.of(circuit(5, 4, 1.0, drive, little))
-        ends.append(np.concatenate([loops.poses[8] - loops.poses[1], loops.poses[6] - loops.poses[3]]))
+    true = Loops.of(circuit(5, 4, 0.0, 0, little)).poses
+
+    def closing(poses: np.ndarray, i: int, j: int) -> np.ndarray:
+        """As seen by somebody who knows the pose at step i."""
+        off, turned = poses[j] - poses[i], true[i, 2] - poses[i, 2]
+        cos, sin = math.cos(turned), math.sin(turned)
+        return np.array([cos * off[0] - sin * off[1], sin * off[0] + cos * off[1], off[2]])
+
+    drives = [Loops.of(circuit(5, 4, 1.0, drive, little)).poses for drive in range(400)]
+    ends = [np.concatenate([closing(poses, 1, 8), closing(poses, 3, 6)]) for poses in drives]
     measured = np.cov(np.array(ends).T) * 1e4
     loops = Loops.of(circuit(5, 4, 0.0, 0, odometry))
     shared = loops.shared(([1], [8]), ([3], [6]))[0]
@@ -155,11 +142,11 @@ def test_errors_that_repeat_are_estimated_along(scale: float, bend: float) -> No
         assert stiff.maps[0].labels != found.labels or stiff.odometry_warning
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=10, deadline=None, derandomize=True)
 @given(st.data())
 def test_the_jacobian_of_a_fit_is_right(data: st.DataObject) -> None:
     trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")
-    problem = _Problem(trace, solve(trace, Theory(displacement="none", prefer=()), maps=1).maps[0])
+    problem = _Problem(trace, solve(trace, Theory.causal().replace(displacement="none")).maps[0])
     assume(len(problem._moved))
     rng = np.random.default_rng(0)
     unknown = problem._begun(None) + 0.01 * rng.normal(size=problem._size)
