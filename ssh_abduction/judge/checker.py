@@ -20,13 +20,13 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from graphlib import CycleError, TopologicalSorter
 from typing import TypeAlias
 
 from ssh_abduction.errors import MapError, brief
-from ssh_abduction.judge.gateways import Clash, Sight, clashes
+from ssh_abduction.judge.gateways import Clash, Sight, clashes, headings
 from ssh_abduction.maps import DState, SSHMap
 from ssh_abduction.star import Openings, Star
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -80,6 +80,15 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
     reading = _Reading(trace, ssh_map, theory)
     checks = [(COHERENCE, test) for test in _COHERENCE] + [(name, AXIOMS[name]) for name in theory.axioms if name in AXIOMS]
     return tuple(Violation(name, tuple(sorted(set(steps))), message) for name, test in checks for steps, message in test(reading))
+
+
+def turned(trace: Trace, ssh_map: SSHMap, theory: Theory) -> SSHMap | None:
+    """A map with headings that all stars of a trace allow (star=gateways), None where they allow none. A map of fewer steps may show other headings."""
+    reading = _Reading(trace, ssh_map, theory)
+    found = headings(*reading.sights, reading.axioms)
+    if any(s.place is not None and s.id not in found for s in ssh_map.dstates):
+        return None
+    return replace(ssh_map, dstates=tuple(replace(s, heading=found.get(s.id)) for s in ssh_map.dstates))
 
 
 def unchecked(theory: Theory) -> tuple[str, ...]:
@@ -356,8 +365,8 @@ class _Reading:
         return {frozenset(pair) for pair in self.map.excused if _is_pair(pair)} if self.theory.boundary == "defeasible" else set()
 
     @cached_property
-    def clashes(self) -> list[Clash]:
-        """The places at which the stars seen cannot be one star in tolerance."""
+    def sights(self) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
+        """The dstates with the stars seen there, by the steps that first have them, and the turns at places that lead from one to another."""
         sights: dict[tuple[int, Star], Sight] = {}
         seen: list[Sight | None] = []
         shown: set[int] = set()
@@ -373,7 +382,12 @@ class _Reading:
         for a, b, action in zip(seen, seen[1:], self.trace.actions, strict=False):
             if a and b and action.kind == "turn" and a.dstate.place == b.dstate.place:
                 turns[a, b].add(action)
-        return list(clashes(list(sights.values()), turns, self.axioms))
+        return list(sights.values()), turns
+
+    @cached_property
+    def clashes(self) -> list[Clash]:
+        """The places at which the stars seen cannot be one star in tolerance."""
+        return list(clashes(*self.sights, self.axioms))
 
     @cached_property
     def conflicts(self) -> list[_Conflict]:

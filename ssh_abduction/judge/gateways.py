@@ -60,40 +60,68 @@ def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> I
     axioms  those that hold
     """
     hard = [name for name in AXIOMS if name in axioms]
-    there: dict[int, list[Sight]] = {}
-    for sight in sights:
-        if sight.dstate.place is not None:
-            there.setdefault(sight.dstate.place, []).append(sight)
-    for place, seen in there.items():
-        if _can_be_one_place(seen, turns, hard):
+    for place, seen in _by_place(sights).items():
+        if _reading(seen, turns, hard) is not None:
             continue
         core = list(seen)
         for sight in reversed(seen):
             rest = [other for other in core if other is not sight]
-            core = core if _can_be_one_place(rest, turns, hard) else rest
-        to_blame = [name for name in hard if _can_be_one_place(core, turns, [other for other in hard if other != name])]
+            core = core if _reading(rest, turns, hard) is not None else rest
+        to_blame = [name for name in hard if _reading(core, turns, [other for other in hard if other != name]) is not None]
         yield Clash(place, tuple(sight.step for sight in core), tuple(to_blame or hard))
 
 
-def _can_be_one_place(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> bool:
-    """Whether each sight has a frame and a shift such that all pairs of sights satisfy the axioms."""
+def headings(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> dict[int, int]:
+    """A heading of each dstate that the stars seen at its place allow, whatever headings the dstates show. Dstates at a place that cannot be are left out."""
+    found: dict[int, int] = {}
+    for seen in _by_place(sights).values():
+        read = _reading(seen, turns, axioms, as_shown=False)
+        for sight, (frame, shift) in zip(seen, read, strict=True) if read else ():
+            if read and sight.shows:
+                found[sight.dstate.id] = _middle(rotations(read[0][0], frame, shift))
+    return found
 
-    def extends(chosen: list[_Turned]) -> bool:
+
+def _by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
+    there: dict[int, list[Sight]] = {}
+    for sight in sights:
+        if sight.dstate.place is not None:
+            there.setdefault(sight.dstate.place, []).append(sight)
+    return there
+
+
+def _reading(sights: Sequence[Sight], turns: Turns, axioms: Collection[str], as_shown: bool = True) -> list[_Turned] | None:
+    """A frame and a shift for each sight such that all pairs of sights satisfy the axioms, or None.
+
+    as_shown  whether the headings have to be those that the dstates show
+    """
+
+    def extended(chosen: list[_Turned]) -> list[_Turned] | None:
         if len(chosen) == len(sights):
-            return True
+            return chosen
         sight = sights[len(chosen)]
         for frame in sight.star.frames:
             for shift in range(max(frame.slots, 1)) if chosen else (0,):
                 here = (frame, shift)
                 before = zip([*sights[: len(chosen)], sight], [*chosen, here], strict=True)
-                if all(_allowed(other, turned, sight, here, turns, axioms) for other, turned in before) and extends([*chosen, here]):
-                    return True
-        return False
+                if all(_allowed(other, turned, sight, here, turns, axioms, as_shown) for other, turned in before):
+                    read = extended([*chosen, here])
+                    if read is not None:
+                        return read
+        return None
 
-    return extends([])
+    return extended([])
 
 
-def _allowed(a: Sight, seen_a: _Turned, b: Sight, seen_b: _Turned, turns: Turns, axioms: Collection[str]) -> bool:
+def _middle(found: Collection[int]) -> int:
+    """A rotation in the middle of an arc of rotations; 0 where there are all or none."""
+    starts = [r for r in sorted(found) if (r - 1) % 360 not in found]
+    ends = [next(d for d in range(1, 361) if (r + d) % 360 not in found) for r in starts]
+    length, start = max(zip(ends, [-r for r in starts], strict=True), default=(1, 0))
+    return (-start + (length - 1) // 2) % 360
+
+
+def _allowed(a: Sight, seen_a: _Turned, b: Sight, seen_b: _Turned, turns: Turns, axioms: Collection[str], as_shown: bool) -> bool:
     """Whether the axioms allow two sights at one place, the first of which comes first, to see so."""
     (first, back), (then, on) = seen_a, seen_b
     shift = (on - back) % max(first.slots, 1)
@@ -108,10 +136,10 @@ def _allowed(a: Sight, seen_a: _Turned, b: Sight, seen_b: _Turned, turns: Turns,
     alike, opposite = _ways(first, then, shift, found)
     sure = not found & {90, 270}
     s, x = a.dstate, b.dstate
-    if "gateway_heading" in axioms:
-        shown = x.heading if a.first and b.shows else 0
-        if (s.id == x.id and not alike) or shown is None or not 0 <= shown < 360 or (a.first and b.shows and found and shown not in found):
-            return False
+    if "gateway_heading" in axioms and s.id == x.id and not alike:
+        return False
+    if "gateway_heading" in axioms and as_shown and a.first and b.shows and not _is_shown(x.heading, found):
+        return False
     if "gateway_dstate" in axioms and s.id != x.id and alike and (sure or 0 not in found):
         return False
     if "gateway_path" in axioms and s.path is not None and x.path is not None:
@@ -120,6 +148,11 @@ def _allowed(a: Sight, seen_a: _Turned, b: Sight, seen_b: _Turned, turns: Turns,
             if (on_course and not way) or (way and not on_course and (sure or towards not in found)):
                 return False
     return True
+
+
+def _is_shown(heading: int | None, found: Collection[int]) -> bool:
+    """Whether a dstate shows a heading, and one that the bearings allow."""
+    return heading is not None and 0 <= heading < 360 and (heading in found or not found)
 
 
 @lru_cache(maxsize=2**14)
