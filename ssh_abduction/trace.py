@@ -238,7 +238,7 @@ class Trace:
     @cached_property
     def in_quarters(self) -> bool:
         """Whether all stars and turns fit right angles: then a star is four openings."""
-        stars = {step.star for step in self.steps if step.star is not None}
+        stars = {tuple(step.star) for step in self.steps if step.star is not None}
         return all(Star.of(star).openings is not None for star in stars) and all(action.in_quarters for action in set(self.actions))
 
     def at(self, step: int) -> str:

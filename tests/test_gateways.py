@@ -9,12 +9,12 @@ from typing import Any
 from unittest.mock import patch
 
 import networkx as nx
-import planar_worlds
+import planar
 import pytest
 from brute_force import key, minimal_maps
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from planar_worlds import drive
+from planar import drive
 
 from ssh_abduction import OnlineMapper, Status, Theory, Trace, TraceError, solve
 from ssh_abduction.judge import gateways as judge
@@ -269,13 +269,13 @@ def test_general_stars_switch_off_what_knows_frames_of_four_slots() -> None:
 
 
 WORLDS: dict[str, tuple[nx.Graph, int, set[object]]] = {
-    "corners of 60 degrees": (planar_worlds.triangle(), 13, set()),
-    "bends of 120 degrees": (planar_worlds.hexagon(), 25, {0}),
-    "three gateways, and a hub": (planar_worlds.wheel(3), 30, {0}),
-    "three gateways, and dead ends": (planar_worlds.junction(0, 120, 240), 16, set()),
-    "five gateways": (planar_worlds.junction(0, 72, 144, 216, 288), 30, set()),
-    "five gateways at odd angles": (planar_worlds.junction(0, 50, 135, 180, 270), 22, set()),
-    "six gateways": (planar_worlds.junction(0, 60, 120, 180, 240, 300), 30, set()),
+    "corners of 60 degrees": (planar.triangle(), 13, set()),
+    "bends of 120 degrees": (planar.hexagon(), 25, {0}),
+    "three gateways, and a hub": (planar.wheel(3), 30, {0}),
+    "three gateways, and dead ends": (planar.junction(0, 120, 240), 16, set()),
+    "five gateways": (planar.junction(0, 72, 144, 216, 288), 30, set()),
+    "five gateways at odd angles": (planar.junction(0, 50, 135, 180, 270), 22, set()),
+    "six gateways": (planar.junction(0, 60, 120, 180, 240, 300), 30, set()),
 }
 
 
@@ -297,7 +297,7 @@ def test_worlds_of_any_gateways_are_mapped_right(name: str) -> None:
 
 @pytest.mark.parametrize(("noise", "unseen"), [(0, False), (8, False), (8, True)])
 def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> None:
-    graph = planar_worlds.scattered(6, random.Random(3))
+    graph = planar.scattered(6, random.Random(3))
     tour = drive(graph, 0, next(iter(graph[0])), 24, random.Random(3), noise=noise, unseen=unseen)
     solution = solve(tour.trace, limit=30)
     assert solution.status is Status.OPTIMAL
@@ -309,7 +309,7 @@ def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> N
 @pytest.mark.parametrize(("spokes", "noise", "unseen"), [(5, 0, False), (6, 0, False), (5, 9, True), (6, 9, True)])
 def test_no_axiom_forbids_the_true_map(spokes: int, noise: float, unseen: bool) -> None:
     """Hubs with a ring road: bearings may be off by less than their spread, and gateways behind the robot need not be observed."""
-    tour = drive(planar_worlds.wheel(spokes), "hub", 0, 24, random.Random(spokes), noise=noise, unseen=unseen)
+    tour = drive(planar.wheel(spokes), "hub", 0, 24, random.Random(spokes), noise=noise, unseen=unseen)
     pairs = [(i, j) for j in range(24) for i in range(j)]
     same = [(i, j) for i, j in pairs if tour.truth[i] == tour.truth[j]]
     elsewhere = [(i, j) for i, j in pairs if tour.truth[i][0] != tour.truth[j][0]]
@@ -323,7 +323,7 @@ def test_no_axiom_forbids_the_true_map(spokes: int, noise: float, unseen: bool) 
 
 
 def test_online_maps_general_stars() -> None:
-    tour = drive(planar_worlds.triangle(), 0, 1, 9, random.Random(0))
+    tour = drive(planar.triangle(), 0, 1, 9, random.Random(0))
     first = tour.trace.steps[0]
     mapper = OnlineMapper(first.view or "", star=first.star, limit=None)
     assert mapper.theory.star == "gateways"
