@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
 from ssh_abduction.asp.limits import Stop
 from ssh_abduction.engines.base import Cost
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver.ranking import weights
 from ssh_abduction.steps.certificate import Basis, Certificate
 from ssh_abduction.steps.noise import LEAST, Noise
 from ssh_abduction.theory.theory import Theory
@@ -76,6 +78,8 @@ class Solution:
     stopped    why the search ended before it was complete, else None
     basis      what the certificate is made from; None where the theory is without an axiom that this rests on
     partial    where no map of the whole trace was found: the best map of its first steps
+    evidence   for each kind of evidence that took part: how many pairs of steps it excluded, and how many sets of equalities it refused
+    odometry_warning  what is wrong with the noise that the odometry claims, if the best map shows that
     """
 
     status: Status
@@ -90,6 +94,13 @@ class Solution:
     basis: Basis | None = field(default=None, repr=False)
     stopped: Stop | None = None
     partial: SSHMap | None = None
+    evidence: Mapping[str, Mapping[str, int]] = field(default_factory=dict, hash=False)
+    odometry_warning: str | None = None
+
+    @property
+    def weights(self) -> tuple[float, ...]:
+        """How likely each of the maps is, among these, as displacements alone say; empty where they are not used."""
+        return weights(self.maps)
 
     @property
     def certificate(self) -> Certificate | None:

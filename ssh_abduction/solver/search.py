@@ -58,8 +58,10 @@ from ssh_abduction.solver.candidates import FRAMING_SHARE, Candidates
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.solver.ranking import Ranking, noise_warning
 from ssh_abduction.solver.result import Bound, Progress, Seconds, Solution, Status
 from ssh_abduction.steps.certificate import Basis
+from ssh_abduction.theory.evidence import evidence_of
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Trace, checked_trace
@@ -137,6 +139,7 @@ class Search:
         check_rules(self.theory)
         self.trace = trace
         self._begun = False
+        self._first: SSHMap | None = None  # of the maps that were given
         self._basis: Basis | None = None  # of the certificate of the whole trace, where the search was stopped
         self._most = maps
         self._goes_on = after is not None
@@ -227,6 +230,15 @@ class Search:
         return self._prefixes.engine.asker.grounding
 
     def __iter__(self) -> Iterator[SSHMap]:
+        found = self._found()
+        if self.theory.displacement == "use":
+            found = Ranking(self.trace).ranked(found, self.over)
+        for ssh_map in found:
+            self._first = self._first or ssh_map
+            yield ssh_map
+
+    def _found(self) -> Iterator[SSHMap]:
+        """The minimal maps, in the order in which they are found; or the best one known."""
         if self._begun:
             raise SolverError("search: expected to be iterated once, got a second time; make another Search")
         self._begun = True
@@ -387,7 +399,15 @@ class Search:
             seconds=Seconds(self._watch.elapsed(), asker.ground_seconds, asker.solve_seconds),
             stopped=self.stopped,
             partial=None if self.best else self._known.partial,
+            evidence=self._said_by_evidence(),
+            odometry_warning=noise_warning(self._first.fit if self._first else None),
         )
+
+    def _said_by_evidence(self) -> dict[str, dict[str, int]]:
+        """For each kind of evidence that takes part, how many pairs of steps it excluded, and how many sets of equalities it refused."""
+        refused = self._known.refused
+        kinds = ((kind.name, kind.pairs(self.trace)) for kind in evidence_of(self.theory))
+        return {name: {"pairs": sum(map(len, pairs.apart.values())), "refused": refused.get(name, 0)} for name, pairs in kinds}
 
     def snapshot(self, stopped: Stop) -> Solution:
         """What is known while the search is still under way in another thread that cannot be stopped. The program ends then: it is of no use any more.
