@@ -15,6 +15,7 @@ from typing import TypeAlias
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 
 from ssh_abduction.maps import DState, Path, SSHMap
+from ssh_abduction.steps import frames
 from ssh_abduction.steps.chart import Chart, FramedChart
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality, evidence_of
@@ -76,7 +77,28 @@ def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
     facts += [f"act({t},{_constant(action.name)})." for t, action in done.items()]
     if theory.level == "topological":
         facts += [_kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None]
+    if theory.star == "gateways":
+        facts += _gateway_facts(trace, start, stop)
     return "\n".join([*facts, *_evidence_facts(trace, theory, start, stop)])
+
+
+def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
+    """What these steps see of gateways, and how that fits what earlier steps see, as facts for gateways.lp."""
+    found = frames.Frames(trace, stop)
+    known = len(frames.Frames(trace, start).frames)
+    yield from (f"star({t},{found.stars[t]})." for t in range(start, stop))
+    yield from (f"looks({star},{x})." for star in dict.fromkeys(found.stars[start:]) for x in found.looks[star])
+    yield from (f"slots({x},{max(frame.slots, 1)})." for x, frame in enumerate(found.frames) if x >= known)
+    for x, y in product(range(len(found.frames)), repeat=2):
+        for shift in found.fits(x, y) if max(x, y) >= known else ():
+            yield f"fits({x},{y},{shift})."
+            yield from (f"may({x},{y},{shift},{way})." for way in frames.may_face(found.frames[x], found.frames[y], shift))
+            yield from (f"must({x},{y},{shift},{way})." for way in frames.must_face(found.frames[x], found.frames[y], shift))
+    turns = {(trace.actions[t - 1], found.stars[t - 1], found.stars[t]): None for t in range(max(start, 1), stop)}
+    for action, a, b in turns:
+        for x, y in product(found.looks[a], found.looks[b]) if action.turn else ():
+            fitting = (c for c in found.fits(x, y) if frames.may_turn(action, found.frames[x], found.frames[y], c))
+            yield from (f"rotates({_constant(action.name)},{x},{y},{shift})." for shift in fitting)
 
 
 def _evidence_facts(trace: Trace, theory: Theory, start: int, stop: int) -> Iterator[str]:
@@ -136,6 +158,7 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
     place: dict[int, int] = {}
     course: dict[int, tuple[int, int]] = {}
     heading: dict[int, int] = {}
+    shape: dict[int, int] = {}
     before: list[tuple[int, int, int]] = []
     excused: list[tuple[int, int]] = []
     for name, args in map(_atom, model.symbols(shown=True)):
@@ -149,8 +172,13 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
             before.append((args[0], args[1], args[2]))
         elif name == "heading":
             heading[args[0]] = args[1]
+        elif name == "shape":
+            shape[args[0]] = args[1]
         elif name == "excused":
             excused.append((args[0], args[1]))
+    if theory.star == "gateways":
+        found = frames.Frames(trace, len(is_at)).frames
+        heading = {t: frames.heading(found[shape[p]], found[shape[t]], heading[t]) for t, p in place.items()}
     return _map(trace, is_at, place, course, heading, before, excused)
 
 

@@ -27,7 +27,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "level": ("causal", "topological"),
     "boundary": ("none", "strict", "defeasible"),
     "path_order": ("partial", "total"),
-    "star": ("auto", "none", "pattern", "frame"),
+    "star": ("auto", "none", "pattern", "frame", "gateways"),
     "displacement": ("auto", "none", "use"),
 }
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
@@ -69,6 +69,8 @@ class Theory:
     next_place       a travel leads to the next place of its path
     all_on_paths     every dstate is along a path, even one that no travel starts or ends at
     star             the openings seen at a place: none, pattern (agree up to rotation), frame (agree when turned by the
+                     heading, and paths go straight on), gateways (the same in any directions, in tolerance); auto is frame where
+                     the trace has stars, and none elsewhere; frame is gateways where stars or turns do not fit right angles
                      heading, and paths go straight on); auto is frame where the trace has stars, and none elsewhere
     displacement     whether displacements are evidence: none, use; auto uses them where the trace has any
     reject           the probability, at most, that displacements refuse a true map of the trace
@@ -90,7 +92,7 @@ class Theory:
     path_order: Literal["partial", "total"] = "total"
     next_place: bool = False
     all_on_paths: bool = False
-    star: Literal["auto", "none", "pattern", "frame"] = "auto"
+    star: Literal["auto", "none", "pattern", "frame", "gateways"] = "auto"
     displacement: Literal["auto", "none", "use"] = "auto"
     reject: float = 0.001
     joint: int = 2
@@ -229,10 +231,10 @@ class Theory:
     def with_frames(self) -> Theory | None:
         """A theory in which places have frames and fewest dstates come first. Its maps, without their headings, are maps of this theory, too.
 
-        None for the causal level. The trace need not have stars. The maps satisfy all axioms of this theory: their paths are totally
+        None for the causal level, and for stars of any gateways. The trace need not have stars. The maps satisfy all axioms of this theory: their paths are totally
         ordered; the axioms of sides, if there are any, hold without excuses; and stars that agree in a frame are one pattern.
         """
-        if self.level == "causal":
+        if self.level == "causal" or self.star == "gateways":
             return None
         boundary = "none" if self.boundary == "none" else "strict"
         rest = [count for count in self.priorities if count in ("paths", "places")]
@@ -250,6 +252,8 @@ class Theory:
         if star != "none" and not trace.has_stars:
             mend = f"add them to the steps, or take {_choice('star', 'none')}"
             raise TheoryError(f"star: expected a trace with stars for star={star}, got none; {mend}")
+        if star == "frame" and not trace.in_quarters:
+            star = "gateways"
         displacement = self.displacement
         if displacement == "auto":
             displacement = "use" if trace.has_displacements else "none"
@@ -283,6 +287,13 @@ class Theory:
             return
         if step.star is None:
             raise TraceError(f"{where}: star: expected one, as other steps have stars; add it, or take {_choice('star', 'none')}")
+        if self.star == "gateways":
+            if step.gateways and (near := step.gateways.too_near):
+                raise TraceError(
+                    f"{where}: star: expected gateways that their spreads tell apart, got {near[0]:g} and {near[1]:g} degrees; "
+                    f"give smaller spreads, or merge the two"
+                )
+            return
         try:
             _ = step.openings
         except TraceError as error:
