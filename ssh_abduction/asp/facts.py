@@ -19,7 +19,7 @@ from ssh_abduction.steps.chart import Chart, FramedChart
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality, evidence_of
 from ssh_abduction.theory.speedups import TRAVELS_AND_TURNS
-from ssh_abduction.theory.theory import Theory
+from ssh_abduction.theory.theory import Count, Theory
 from ssh_abduction.trace import Action, Trace
 
 _COURSE = {"pos": 1, "neg": -1}
@@ -378,6 +378,17 @@ def forbidden_equalities(equalities: Iterable[Equality]) -> str:
     """The rule that these equalities of steps do not all hold."""
     atoms = [f"same{'' if e.of == 'dstate' else '_place'}({min(e.first, e.second)},{max(e.first, e.second)})" for e in equalities]
     return f":- {', '.join(atoms)}."
+
+
+def exactly(number: int, count: Count) -> str:
+    """The rule that a map has just so many dstates, places or paths, while `of_number` is true."""
+    counted = {"dstates": "T : is(T,T)", "places": "T : at(T,T)", "paths": "(T,H) : first_along(T,H)"}[count]
+    return f"#external {of_number(number, count)}.\n:- {of_number(number, count)}, #count {{ {counted} }} != {number}."
+
+
+def of_number(number: int, count: Count) -> Symbol:
+    """The external atom that says that maps have just so many dstates, places or paths."""
+    return Function("of_number", [Function(count), *numbers(number)])
 
 
 def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:

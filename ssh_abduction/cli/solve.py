@@ -14,7 +14,7 @@ from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
-from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, on_ctrl_c, opening, warn, warnings_of
+from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, on_ctrl_c, opening, told, warn, warnings_of
 from ssh_abduction.cli.text import describe, differences, headline
 from ssh_abduction.explain import Explanation
 from ssh_abduction.maps import SSHMap
@@ -32,6 +32,8 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser("solve", help="find the minimal maps of a trace, or of many", description=text)
     parser.add_argument("traces", nargs="+", metavar="trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument("-n", "--maps", type=int, default=100, metavar="K", help="stop after K maps; 0 for all (default: 100)")
+    more = "list maps with up to K dstates more than the least, too: for each number of dstates the best (default: 0)"
+    parser.add_argument("--within", type=int, default=0, metavar="K", help=more)
     parser.add_argument(
         "--json", action="store_true", help="print the solution as JSON, map by map as they are found; of many traces, a line each"
     )
@@ -68,6 +70,7 @@ def run(options: argparse.Namespace) -> int:
                 theory,
                 limit=options.time_limit,
                 maps=options.maps,
+                within=options.within,
                 memory=options.memory_limit,
                 speedups=Speedups.without(options.without_speedups),
                 on_progress=on_progress,
@@ -148,7 +151,7 @@ class _Json:
 
     def _line(self, ssh_map: SSHMap) -> str:
         self._maps += 1
-        return ("," if self._maps > 1 else "") + "\n" + dump(ssh_map.to_dict())
+        return ("," if self._maps > 1 else "") + "\n" + dump(told(self._search, ssh_map))
 
 
 def _lines(search: Search, solution: Solution, explanation: Explanation | None) -> Iterator[str]:

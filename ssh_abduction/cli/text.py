@@ -25,7 +25,15 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
     counts = ", ".join(counted(v, k) for k, v in solution.cost.to_dict().items())
     if solution.status is Status.FEASIBLE:
         return f"feasible{why}: {counts}, not proven minimal; any map has {bound or 'no proven bound'}; {seconds}"
-    return f"optimal: {counts}; {counted(count, 'minimal maps')}{'' if solution.complete else f', and there may be more{why}'}; {seconds}"
+    found = counted(solution.levels[0].count if solution.levels else count, "minimal maps") + _levels_above(solution)
+    return f"optimal: {counts}; {found}{'' if solution.complete else f', and there may be more{why}'}; {seconds}"
+
+
+def _levels_above(solution: Solution) -> str:
+    """How many maps cost more than the least, and what they cost."""
+    return "".join(
+        f"; {level.count} with {', '.join(counted(v, k) for k, v in level.cost.to_dict().items())}" for level in solution.levels[1:]
+    )
 
 
 def counted(number: int, things: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from ssh_abduction.asp.control import Asker, has_processors
@@ -41,6 +41,11 @@ class Cost:
     def to_dict(self) -> dict[str, int]:
         counts = {"dstates": self.dstates, "places": self.places, "paths": self.paths}
         return {**counts, "excuses": self.excuses} if self.excuses else counts
+
+
+def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> Cost:
+    """The counts of a map: those that the theory prefers as clingo counted them, since it may count more than the map can show where axioms are left out."""
+    return replace(Cost.of(ssh_map), **dict(zip(theory.priorities, cost, strict=True)))
 
 
 @dataclass(frozen=True, slots=True)

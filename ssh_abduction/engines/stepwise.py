@@ -12,6 +12,7 @@ from ssh_abduction.asp.control import Asker
 from ssh_abduction.engines.base import Found, Task
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.theory import Count
 
 # A prefix grows by this factor at least, so that there are few of them.
 GROWTH = 1.25
@@ -34,6 +35,7 @@ class StepEngine:
         self._task = task
         self._asked: int | None = None  # the step that is the last one, as far as clingo knows
         self._forbidden: list[Collection[Equality]] = []
+        self._number: tuple[int, Count] | None = None  # how many dstates, places or paths maps have, where somebody asked for just so many
         # Seconds and MiB that it took to ground the last step: the next one takes about as much, and cannot be stopped.
         self._last_step = 0.0, 0.0
         control = self.asker.control
@@ -45,7 +47,7 @@ class StepEngine:
     def with_paths(self, paths: int) -> StepEngine:
         engine = StepEngine(self._task, paths)
         engine.asker.ground_seconds, engine.asker.solve_seconds = self.asker.ground_seconds, self.asker.solve_seconds
-        engine._forbidden = list(self._forbidden)
+        engine._forbidden, engine._number = list(self._forbidden), self._number
         return engine
 
     def over(self, task: Task) -> StepEngine:
@@ -69,6 +71,7 @@ class StepEngine:
             if is_new:
                 for number in range(len(self._forbidden)):
                     self._tell_forbidden(number)
+                self._tell_number()
 
     def _ground_steps(self, stop: int) -> None:
         """Ground the steps up to this one."""
@@ -111,6 +114,21 @@ class StepEngine:
         self._forbidden.append(equalities)
         self._tell_forbidden(len(self._forbidden) - 1)
         return True
+
+    def ask_for(self, number: int, count: Count) -> None:
+        """From now on maps have just so many dstates, places or paths, and the prefix does not grow any more."""
+        if self._number is not None:
+            self.asker.control.release_external(facts.of_number(*self._number))
+        self._number = number, count
+        self._tell_number()
+
+    def _tell_number(self) -> None:
+        if self._number is None:
+            return
+        part = f"number_{self._number[0]}"
+        self.asker.control.add(part, [], facts.exactly(*self._number))
+        self.asker.control.ground([(part, [])])
+        self.asker.control.assign_external(facts.of_number(*self._number), True)
 
     def settle(self) -> None:
         """Nothing goes on in clingo beyond an answer."""

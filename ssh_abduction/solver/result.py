@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any
 
 from ssh_abduction.asp.limits import Stop
-from ssh_abduction.engines.base import Cost
+from ssh_abduction.engines.base import Cost, cost_as_counted
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.steps.certificate import Basis, Certificate
 from ssh_abduction.steps.noise import LEAST, Noise
@@ -63,19 +64,36 @@ class Progress:
 
 
 @dataclass(frozen=True, slots=True)
+class Level:
+    """The best maps of those with one number of dstates; of paths or places, where the theory prefers these first.
+
+    cost   the counts of the first of them. All share the counts that the theory prefers
+    count  how many there are
+    """
+
+    cost: Cost
+    count: int
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"cost": self.cost.to_dict(), "count": self.count}
+
+
+@dataclass(frozen=True, slots=True)
 class Solution:
     """The answer for one trace.
 
-    maps       minimal maps (status optimal), or the best one found (feasible)
+    maps       minimal maps (status optimal), or the best one found (feasible); with `within`, behind them those with more dstates
     cost       the counts of the first of these maps; None where there is none. All share the counts that the theory prefers
     bound      proven lower bounds on the counts of any map
-    complete   no further minimal map exists
+    complete   no further minimal map exists, and with `within` no further one that is to be listed
     theory     the theory, with star settled
     steps      length of the trace
     prefix     how many of its first steps had to be given to clingo
     stopped    why the search ended before it was complete, else None
     basis      what the certificate is made from; None where the theory is without an axiom that this rests on
     partial    where no map of the whole trace was found: the best map of its first steps
+    within     how many dstates more than the least a map may have to be listed
+    levels     how many minimal maps were given and, with `within`, how many that have more dstates: a level for each number of them that some map has
     """
 
     status: Status
@@ -90,6 +108,15 @@ class Solution:
     basis: Basis | None = field(default=None, repr=False)
     stopped: Stop | None = None
     partial: SSHMap | None = None
+    within: int = 0
+    levels: tuple[Level, ...] = ()
+
+    @property
+    def costs(self) -> tuple[Cost, ...]:
+        """The counts of each map, where the maps are the first ones that were given."""
+        levels = self.levels or ((Level(self.cost, self.count),) if self.cost else ())
+        cost_of = (level.cost for level in levels for _ in range(level.count))
+        return tuple(cost_as_counted(m, cost.preferred_by(self.theory), self.theory) for m, cost in zip(self.maps, cost_of, strict=False))
 
     @property
     def certificate(self) -> Certificate | None:

@@ -49,7 +49,7 @@ from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import LimitError, StageTimeError, Stop, Watch, check_limit
 from ssh_abduction.asp.rules import check_rules
-from ssh_abduction.engines.base import AT_ONCE, Engine, Task
+from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Task, cost_as_counted
 from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.maps import SSHMap
@@ -57,8 +57,9 @@ from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.candidates import FRAMING_SHARE, Candidates
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
+from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.solver.result import Bound, Progress, Seconds, Solution, Status
+from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solution, Status
 from ssh_abduction.steps.certificate import Basis
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -77,6 +78,7 @@ def solve(
     *,
     limit: float | None = None,
     maps: int = 100,
+    within: int = 0,
     memory: int | None = None,
     speedups: Speedups = ALL,
     on_progress: Callable[[Progress], None] | None = None,
@@ -88,6 +90,8 @@ def solve(
     limit        seconds of wall-clock time; when they are over, the best answer so far is returned
     maps         list at most so many maps; 0 lists all (take `Search` to stream them). Where there are so many, one more is sought for a second,
                  or a tenth of the time so far: only if that ends the answer is complete
+    within       list maps with up to so many dstates more than the least, too: for each number of dstates the maps that are minimal among those with just so
+                 many, in the order of these numbers. Where the theory prefers few paths or places first, these are counted instead
     memory       MiB of memory that the process may use at its peak before the search stops
     speedups     which speed-ups are on; none changes the answer
     on_progress  is told now and then how far the search is
@@ -98,7 +102,7 @@ def solve(
     """
     theory = checked_theory(theory).replace(**choices)
     theory.check_steps(checked_trace(trace))
-    search = Search(trace, theory, limit=limit, maps=maps, memory=memory, speedups=speedups, on_progress=on_progress)
+    search = Search(trace, theory, limit=limit, maps=maps, within=within, memory=memory, speedups=speedups, on_progress=on_progress)
     return search.solution(tuple(search))
 
 
@@ -118,6 +122,7 @@ class Search:
         *,
         limit: float | None = None,
         maps: int = 100,
+        within: int = 0,
         memory: int | None = None,
         speedups: Speedups = ALL,
         on_progress: Callable[[Progress], None] | None = None,
@@ -129,6 +134,10 @@ class Search:
             raise SolverError(f"maps (--maps): expected a whole number, 0 for all, got {brief(maps)}")
         if maps < 0:
             raise SolverError(f"maps (--maps): expected 0 (all) or more, got {maps}")
+        if isinstance(within, bool) or not hasattr(within, "__index__") or within < 0:
+            raise SolverError(
+                f"within (--within): expected a whole number, 0 or more, got {brief(within)}; say how much more than the least a map may cost"
+            )
         check_limit("limit (--time-limit)", "seconds", limit)
         check_limit("memory (--memory-limit)", "MiB", memory)
         if on_progress is not None and not callable(on_progress):
@@ -139,6 +148,11 @@ class Search:
         self._begun = False
         self._basis: Basis | None = None  # of the certificate of the whole trace, where the search was stopped
         self._most = maps
+        self.within = int(within)
+        self._near: NearMinimal | None = None  # what lists maps that cost more than the least, once these are listed
+        self._levels: list[Level] = []
+        self._cost: tuple[int, ...] = ()  # of the map that was given last: the preferred counts
+        self._last: SSHMap | None = None  # that was given
         self._goes_on = after is not None
         self._asked_speedups = checked_speedups(speedups)
         self._on_progress = on_progress
@@ -217,14 +231,24 @@ class Search:
         return self._known.count
 
     @property
+    def cost(self) -> Cost | None:
+        """What the map costs that was given last."""
+        return None if self._last is None else cost_as_counted(self._last, self._cost, self.theory)
+
+    @property
     def prefix(self) -> int:
         """How many steps clingo was given."""
-        return self._prefixes.engine.size
+        return self._engine.size
 
     @property
     def grounding(self) -> Grounding:
         """Rules and atoms of the ground program that clingo solved last."""
-        return self._prefixes.engine.asker.grounding
+        return self._engine.asker.grounding
+
+    @property
+    def _engine(self) -> Engine:
+        """The engine that was asked last."""
+        return self._near.engine if self._near else self._prefixes.engine
 
     def __iter__(self) -> Iterator[SSHMap]:
         if self._begun:
@@ -234,7 +258,7 @@ class Search:
         try:
             self._make_first_map()
             self._find_minimum()
-            yield from self._list_minimal_maps()
+            yield from self._list_maps()
         except StageTimeError:
             self._known.stopped = "maps limit"
         except LimitError as limit:
@@ -293,10 +317,10 @@ class Search:
 
             self._prefixes.go_on_with(FramelessEngine(self._task, labels), len(self.trace))
 
-    def _list_minimal_maps(self) -> Iterator[SSHMap]:
-        """Give the minimal maps, as many as were asked for, once they have passed the checker. The clock stands still while the caller has one."""
+    def _list_maps(self) -> Iterator[SSHMap]:
+        """Give the maps, as many as were asked for, once they have passed the checker. The clock stands still while the caller has one."""
         if self.status is Status.OPTIMAL:
-            for ssh_map in self._prefixes.minimal_maps():
+            for ssh_map, cost in self._maps_by_cost():
                 if self._most and self.count == self._most:
                     self._known.stopped = "maps limit"
                     return
@@ -304,6 +328,7 @@ class Search:
                 # The first map is the best one: so the cost is its, also in the counts that the theory does not prefer.
                 self._known.best = self.best if self.count else ssh_map
                 self._known.count += 1
+                self._take_down(ssh_map, cost)
                 self._report()
                 self._watch.stop()
                 yield ssh_map
@@ -312,6 +337,22 @@ class Search:
                     spent = self._watch.elapsed()
                     self._watch.end_stage_after(spent + max(ONE_MORE, ONE_MORE_SHARE * spent))
         self._known.complete = True
+
+    def _maps_by_cost(self) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
+        """The minimal maps, and behind them those that cost up to `within` more, each with its preferred counts."""
+        yield from ((ssh_map, self._known.cost) for ssh_map in self._prefixes.minimal_maps())
+        if self.within and counted_first(self.theory):
+            self._prefixes.engine.settle()
+            self._near = NearMinimal(self._task, self._judging, self._most, self._report, self._prefixes.engine.asker)
+            yield from self._near.maps(self._known.cost, self.within)
+
+    def _take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
+        """Remember the map that is given, and count it at its level."""
+        begins = not self._levels or cost != self._cost
+        self._last, self._cost = ssh_map, cost
+        if begins:
+            self._levels.append(Level(cost_as_counted(ssh_map, cost, self.theory), 0))
+        self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
 
     def _end_clingo(self) -> None:
         """End what is still under way, and take the bound that it leaves."""
@@ -350,6 +391,7 @@ class Search:
         if self.status in (Status.FEASIBLE, Status.OPTIMAL) and not self.count and self.best is not None:
             self._judging.pass_map(self.best, self.prefix, self._watch.elapsed())
             self._known.count = 1
+            self._take_down(self.best, self._known.cost)
             yield self.best
 
     def interrupt(self) -> None:
@@ -370,10 +412,10 @@ class Search:
 
     def solution(self, maps: tuple[SSHMap, ...] = ()) -> Solution:
         """How the search ended, with the maps that the caller kept."""
-        asker = self._prefixes.engine.asker
+        asker = self._engine.asker
         # Perhaps the search ended while the prefix was given to clingo: then what shows the bound is sought in all steps.
         ran_out = self.stopped not in (None, "maps limit")
-        basis = self._basis or self._basis_of(len(self.trace) if ran_out else self.prefix)
+        basis = self._basis or self._basis_of(len(self.trace) if ran_out else self._prefixes.engine.size)
         return Solution(
             status=self.status,
             maps=maps,
@@ -387,6 +429,8 @@ class Search:
             seconds=Seconds(self._watch.elapsed(), asker.ground_seconds, asker.solve_seconds),
             stopped=self.stopped,
             partial=None if self.best else self._known.partial,
+            within=self.within,
+            levels=tuple(self._levels),
         )
 
     def snapshot(self, stopped: Stop) -> Solution:
