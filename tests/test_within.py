@@ -31,7 +31,7 @@ def at(ssh_map: SSHMap) -> list[int | None]:
     return [ssh_map.dstates[label].place for label in ssh_map.labels]
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(st.data())
 def test_near_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
     """Each map once, in the order of cost, each with its own cost."""
@@ -87,9 +87,9 @@ def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
 
 
 def test_without_an_order_behind_dstates_all_maps_of_so_few_dstates_are_listed() -> None:
-    """Then the levels are what clingo counts of maps with dstates, at most three more than the least."""
-    solution = solve(Trace.load(ACES3), prefer=("dstates",), maps=0, within=3)
-    assert [(level.cost.dstates, level.count) for level in solution.levels] == [(19, 68), (20, 158), (22, 468)]
+    """Then the levels are what clingo counts of maps with dstates, at most one more than the least."""
+    solution = solve(Trace.load(ACES3), prefer=("dstates",), maps=0, within=1)
+    assert [(level.cost.dstates, level.count) for level in solution.levels] == [(19, 68), (20, 158)]
 
 
 @pytest.mark.parametrize(("maps", "levels"), [(3, [3]), (4, [4]), (5, [4, 1]), (7, [4, 1, 2]), (11, [4, 1, 6])])

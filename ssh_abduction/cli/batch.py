@@ -33,6 +33,7 @@ from ssh_abduction.errors import SolverError, SSHError, brief, named, printable
 from ssh_abduction.explain import Explanation
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
+from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
@@ -110,6 +111,7 @@ class Question:
             limit=self.limit,
             maps=self.maps,
             within=self.within,
+            reasons=self.json,
             memory=self.memory,
             speedups=self.speedups,
             on_progress=on_progress,
@@ -119,7 +121,7 @@ class Question:
             for ssh_map in search:
                 maps += [told(search, ssh_map)] if self.json else []
             explanation = explained(search)
-            return self._told(number, path, search, search.solution(), maps, explanation, search.grounding)
+            return self._told(number, path, search, search.solution(), maps, explanation, search.grounding, search.backbone)
 
     def _guarded(
         self, number: int, path: str, search: Search, maps: list[dict[str, Any]], given_up: Callable[[], bool]
@@ -130,7 +132,7 @@ class Question:
             solution = search.snapshot(why)
             found = [*maps] or [ssh_map.to_dict() for ssh_map in solution.maps if self.json]
             return self._told(
-                number, path, search, solution, found, None, Grounding(0, 0)
+                number, path, search, solution, found, None, Grounding(0, 0), None
             ), EXIT_ERROR  # of the process, which nobody reads
 
         if not workers.serves():
@@ -146,10 +148,13 @@ class Question:
         maps: Sequence[dict[str, Any]],
         explanation: Explanation | None,
         grounding: Grounding,
+        backbone: Backbone | None,
     ) -> Answer:
         if self.json:
             count = len(maps)
-            line = dump({"trace": path, **opening(search), "maps": maps, **ending(search, solution, explanation, count, grounding)})
+            line = dump(
+                {"trace": path, **opening(search), "maps": maps, **ending(search, solution, explanation, count, grounding, backbone)}
+            )
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
         return Answer(number, line, exit_code(solution), tuple(warnings_of(search, solution)))

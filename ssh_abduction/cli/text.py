@@ -8,7 +8,11 @@ from ssh_abduction.errors import printable
 from ssh_abduction.explain import Explanation
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.result import Solution, Status
+from ssh_abduction.solver.sharing import Backbone, stretches
 from ssh_abduction.trace import Trace
+
+# So many pairs of steps are told of, at most, as more cannot be taken in on a terminal.
+SHOWN_PAIRS = 12
 
 
 def headline(solution: Solution, count: int, explanation: Explanation | None) -> str:
@@ -66,6 +70,23 @@ def describe(ssh_map: SSHMap) -> str:
         parts.append(table(["dstate", "view", "place", "path", "links"], rows))
     else:
         parts.append(table(["dstate", "view", "links"], [[row[0], row[1], row[4]] for row in rows]))
+    return "\n".join(parts)
+
+
+def describe_backbone(backbone: Backbone, trace: Trace) -> str:
+    """For each dstate that all minimal maps have, the steps at it; then the steps that are one dstate, or at one place, in some minimal maps only."""
+    steps: dict[int, list[int]] = {}
+    for t, number in enumerate(backbone.dstates.always):
+        steps.setdefault(number, []).append(t)
+    rows = [[trace.steps[some[0]].view, stretches(some)] for some in steps.values()]
+    parts = [
+        table(["view", "steps at one dstate in all minimal maps" if backbone.proven else "steps at one dstate in all maps found"], rows)
+    ]
+    for sort, pairs in (("one dstate", backbone.dstates.sometimes), ("at one place", backbone.places.sometimes if backbone.places else ())):
+        if pairs:
+            more = f", and {len(pairs) - SHOWN_PAIRS} more" if len(pairs) > SHOWN_PAIRS else ""
+            told = ", ".join(f"{i} and {j}" for i, j in pairs[:SHOWN_PAIRS])
+            parts.append(f"  {sort} in some of them: the steps {told}{more}")
     return "\n".join(parts)
 
 

@@ -8,6 +8,7 @@ from typing import Protocol
 
 from ssh_abduction.asp.control import Asker, has_processors
 from ssh_abduction.asp.limits import Watch
+from ssh_abduction.engines.doubts import Settled
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
@@ -147,6 +148,10 @@ class Engine(Protocol):
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         """All maps of the prefix that cost this and no more; or `enough` of them, unless that is 0."""
+        ...
+
+    def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled] | None:
+        """All labels that maps of the prefix have which cost this and no more, each once; None where dstates are not settled before places and paths."""
         ...
 
     def forbid(self, equalities: Collection[Equality]) -> bool:

@@ -10,6 +10,8 @@ import clingo
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker
 from ssh_abduction.engines.base import Found, Task
+from ssh_abduction.engines.doubts import Doubt, Doubts
+from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.theory import Count
@@ -39,6 +41,7 @@ class StepEngine:
         # Seconds and MiB that it took to ground the last step: the next one takes about as much, and cannot be stopped.
         self._last_step = 0.0, 0.0
         control = self.asker.control
+        self._doubts = Doubts(self.asker, control, facts.steps_are_one)
         for name in facts.encoding_names(task.theory):
             control.load(encodings.path(name))
         control.add("base", [], facts.theory_facts(task.theory, paths))
@@ -110,6 +113,14 @@ class StepEngine:
         bound = ",".join(map(str, cost))
         return self.asker.answers(self._read, f"enum,{bound}" if bound else "ignore", 0)
 
+    def map_with(self, doubts: Collection[Doubt], cost: tuple[int, ...]) -> SSHMap | None:
+        """A map of the prefix that costs at most this, in which any of these doubts about steps holds; None where there is none."""
+        found = self._doubts.answer(doubts, self._read, f"enum,{','.join(map(str, cost))}" if cost else "ignore")
+        return None if found is None else found.map
+
+    def labellings(self, cost: tuple[int, ...]) -> None:
+        """Dstates are not settled before places and paths."""
+
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._forbidden.append(equalities)
         self._tell_forbidden(len(self._forbidden) - 1)
@@ -140,3 +151,17 @@ class StepEngine:
 
     def _read(self, model: clingo.Model) -> Found:
         return Found(facts.read_map(model, self._task.trace, self._task.theory), tuple(model.cost))
+
+
+def paths_needed(task: Task, size: int, cost: tuple[int, ...] | None) -> int:
+    """How many names for paths it takes to be sure that no map of the prefix has another cost, or is missed at this one."""
+    theory = task.theory
+    segments = facts.most_paths(task.trace, theory, size)
+    first = theory.priorities[0] if theory.priorities else None
+    if theory.level == "causal":
+        return 0
+    if cost is None or not task.speedups.path_names or first not in ("paths", "dstates"):
+        return segments
+    if first == "paths":
+        return cost[0]
+    return min(segments, cost[0] // (1 if "course_needs_travel" in theory.given_up else 2))

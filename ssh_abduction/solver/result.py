@@ -9,6 +9,8 @@ from typing import Any
 from ssh_abduction.asp.limits import Stop
 from ssh_abduction.engines.base import Cost, cost_as_counted
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver.backbone import Rivals
+from ssh_abduction.solver.sharing import Backbone, Sharing
 from ssh_abduction.steps.certificate import Basis, Certificate
 from ssh_abduction.steps.noise import LEAST, Noise
 from ssh_abduction.theory.theory import Theory
@@ -94,6 +96,7 @@ class Solution:
     partial    where no map of the whole trace was found: the best map of its first steps
     within     how many dstates more than the least a map may have to be listed
     levels     how many minimal maps were given and, with `within`, how many that have more dstates: a level for each number of them that some map has
+    rivals     what the backbone is worked out from; where there is none, it is worked out from the maps listed
     """
 
     status: Status
@@ -110,6 +113,7 @@ class Solution:
     partial: SSHMap | None = None
     within: int = 0
     levels: tuple[Level, ...] = ()
+    rivals: Rivals | None = field(default=None, repr=False, compare=False)
 
     @property
     def costs(self) -> tuple[Cost, ...]:
@@ -117,6 +121,31 @@ class Solution:
         levels = self.levels or ((Level(self.cost, self.count),) if self.cost else ())
         cost_of = (level.cost for level in levels for _ in range(level.count))
         return tuple(cost_as_counted(m, cost.preferred_by(self.theory), self.theory) for m, cost in zip(self.maps, cost_of, strict=False))
+
+    @property
+    def minimal_listed(self) -> bool:
+        """Whether all minimal maps were given, even if not all that `within` asks for were."""
+        return self.complete or (self.rivals is not None and self.rivals.listed)
+
+    @property
+    def backbone(self) -> Backbone | None:
+        """What all minimal maps share; None where no minimal map is known.
+
+        Where not all are listed it is worked out when it is first asked for, by reasoning, which may take as long as the search was allowed to. If that is not
+        enough, or Ctrl-C ends it, the backbone is not `proven`: it is then what those minimal maps share that were found.
+        """
+        if self.rivals is not None:
+            self.rivals.reason(anew=True)
+            return self.rivals.backbone
+        sharing = Sharing()
+        for ssh_map in self.maps if self.status is Status.OPTIMAL else ():
+            sharing.absorb(ssh_map)
+        return sharing.backbone(proven=self.complete) if sharing.maps else None
+
+    @property
+    def summary(self) -> str:
+        """What the answer is, in one sentence: how many minimal maps there are, what all of them share, and in which steps they differ."""
+        return summary_of(self, self.count, self.backbone)
 
     @property
     def certificate(self) -> Certificate | None:
@@ -136,3 +165,24 @@ class Solution:
     def count(self) -> int:
         """How many maps are listed."""
         return len(self.maps)
+
+
+def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str:
+    """One sentence on how many minimal maps there are, what all of them share, and in which steps they differ.
+
+    count     how many maps were given, of which the solution need not hold any
+    backbone  what the minimal maps share, as far as it is known
+    """
+    if solution.status is Status.UNSATISFIABLE:
+        return "no map satisfies the axioms"
+    if backbone is None:
+        return "a map that is not proven minimal" if solution.cost else "no map was found"
+    minimal = solution.levels[0].count if solution.levels else count
+    listed = solution.minimal_listed
+    told = f"{'' if listed else 'at least '}{minimal} minimal map{'' if minimal == 1 else 's'}"
+    if not listed:
+        told += f" (listing was stopped by the {solution.stopped})" if solution.stopped != "interrupted" else " (listing was interrupted)"
+    if not (listed and minimal == 1):
+        told += f": {backbone.sentence}" + ("" if backbone.proven else ", as far as was found out: others may differ in more")
+    more = sum(level.count for level in solution.levels[1:])
+    return told + (f"; and {more} with up to {solution.within} more" if more else "")

@@ -54,12 +54,14 @@ from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import prefixes
+from ssh_abduction.solver.backbone import Rivals
 from ssh_abduction.solver.candidates import FRAMING_SHARE, Candidates
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solution, Status
+from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.steps.certificate import Basis
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -69,6 +71,7 @@ FEW_STEPS = 24  # Traces up to this length skip names and greedy maps: solving t
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.
 ONE_MORE_SHARE = 0.1  # Or for such a share of the time that these took, if that is more, so that it is never a large part of the search.
 FRAME_AFTER = 1.0  # After so many seconds step by step a map with frames is sought, where the theory does not ask for one: most traces are solved by then.
+REASONING = 5.0  # For so many seconds it is sought what all minimal maps share, where the search took less and has no time limit.
 ALL = Speedups()
 
 
@@ -111,6 +114,8 @@ class Search:
 
     Parameters as in `solve`, and, to go on when a trace has grown (`online.py`):
 
+    reasons  whether to find out, at the end, what all minimal maps share, where not all are listed. A share of the time limit is kept for that; without a
+             limit it takes as long as the search at most, or REASONING seconds, if that is more
     after    a search of this trace's first steps, which has ended: what it grounded and proved is taken over
     minimal  a map of this trace that costs what `after` proved: it is minimal, and only the others remain to be found
     """
@@ -126,6 +131,7 @@ class Search:
         memory: int | None = None,
         speedups: Speedups = ALL,
         on_progress: Callable[[Progress], None] | None = None,
+        reasons: bool = False,
         after: Search | None = None,
         minimal: SSHMap | None = None,
     ) -> None:
@@ -151,6 +157,7 @@ class Search:
         self.within = int(within)
         self._near: NearMinimal | None = None  # what lists maps that cost more than the least, once these are listed
         self._levels: list[Level] = []
+        self._reasons = reasons
         self._cost: tuple[int, ...] = ()  # of the map that was given last: the preferred counts
         self._last: SSHMap | None = None  # that was given
         self._goes_on = after is not None
@@ -160,6 +167,7 @@ class Search:
         self._task = Task.of(trace, self.theory, self._watch, speedups)
         self._known = Known(self.theory)
         self._judging = Judging(trace, self.theory)
+        self._rivals = Rivals(self._task, self._judging)
         self._candidates = Candidates(self._task, self._known, self._judging, self._report)
         engine = self._engine_after(after) if after else self._new_engine()
         self._prefixes = Prefixes(self._task, self._known, self._judging, engine, maps, self._report)
@@ -236,6 +244,11 @@ class Search:
         return None if self._last is None else cost_as_counted(self._last, self._cost, self.theory)
 
     @property
+    def backbone(self) -> Backbone | None:
+        """What the minimal maps share that are known so far; None where none is."""
+        return self._rivals.backbone
+
+    @property
     def prefix(self) -> int:
         """How many steps clingo was given."""
         return self._engine.size
@@ -260,7 +273,7 @@ class Search:
             self._find_minimum()
             yield from self._list_maps()
         except StageTimeError:
-            self._known.stopped = "maps limit"
+            self._known.stopped = "maps limit" if self.count == self._most else "time limit"
         except LimitError as limit:
             self._known.stopped = limit.reason
         except KeyboardInterrupt:
@@ -272,6 +285,8 @@ class Search:
             self._end_clingo()
         self._fall_back()
         yield from self._give_best_map()
+        if self._reasons:
+            self._reason()
 
     def _make_first_map(self) -> None:
         """Make a causal map at once, that clingo has to better."""
@@ -320,6 +335,9 @@ class Search:
     def _list_maps(self) -> Iterator[SSHMap]:
         """Give the maps, as many as were asked for, once they have passed the checker. The clock stands still while the caller has one."""
         if self.status is Status.OPTIMAL:
+            ends = self._watch.reserve_begins if self._reasons else math.inf
+            ends = ends if ends > self._watch.elapsed() else math.inf
+            self._watch.end_stage_after(ends)
             for ssh_map, cost in self._maps_by_cost():
                 if self._most and self.count == self._most:
                     self._known.stopped = "maps limit"
@@ -335,12 +353,13 @@ class Search:
                 self._watch.start()
                 if self.count == self._most:
                     spent = self._watch.elapsed()
-                    self._watch.end_stage_after(spent + max(ONE_MORE, ONE_MORE_SHARE * spent))
+                    self._watch.end_stage_after(min(ends, spent + max(ONE_MORE, ONE_MORE_SHARE * spent)))
         self._known.complete = True
 
     def _maps_by_cost(self) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
         """The minimal maps, and behind them those that cost up to `within` more, each with its preferred counts."""
         yield from ((ssh_map, self._known.cost) for ssh_map in self._prefixes.minimal_maps())
+        self._rivals.listed = True
         if self.within and counted_first(self.theory):
             self._prefixes.engine.settle()
             self._near = NearMinimal(self._task, self._judging, self._most, self._report, self._prefixes.engine.asker)
@@ -350,6 +369,8 @@ class Search:
         """Remember the map that is given, and count it at its level."""
         begins = not self._levels or cost != self._cost
         self._last, self._cost = ssh_map, cost
+        if self.status is Status.OPTIMAL and cost == self._known.cost:
+            self._rivals.add(ssh_map, cost)
         if begins:
             self._levels.append(Level(cost_as_counted(ssh_map, cost, self.theory), 0))
         self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
@@ -360,6 +381,7 @@ class Search:
         self._watch.stop()
         self._prefixes.engine.settle()
         self._known.raise_bound(self._prefixes.engine.bound)
+        self._rivals.engine = None if self._rivals.listed or not self._prefixes.engine.intact else self._prefixes.engine
 
     def _fall_back(self) -> None:
         """Where the search was stopped: some map of the whole trace, if there was none, and a bound that takes no search."""
@@ -393,6 +415,16 @@ class Search:
             self._known.count = 1
             self._take_down(self.best, self._known.cost)
             yield self.best
+
+    def _reason(self) -> None:
+        """Find out what all minimal maps share, where not all are listed."""
+        self._watch.use_reserve()
+        self._watch.start()
+        spent = self._watch.elapsed()
+        self._watch.end_stage_after(spent + max(REASONING, spent) if self._watch.left() == math.inf else math.inf)
+        self._rivals.reason()
+        self._watch.end_stage_after(math.inf)
+        self._watch.stop()
 
     def interrupt(self) -> None:
         """End the search soon, with the best answer so far. For signal handlers and other threads."""
@@ -431,6 +463,7 @@ class Search:
             partial=None if self.best else self._known.partial,
             within=self.within,
             levels=tuple(self._levels),
+            rivals=self._rivals,
         )
 
     def snapshot(self, stopped: Stop) -> Solution:
