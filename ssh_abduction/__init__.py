@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
     from ssh_abduction.maps import DState, Path, SSHMap
     from ssh_abduction.online.mapper import OnlineMapper
-    from ssh_abduction.solver.result import Bound, Progress, Solution, Status
+    from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
+    from ssh_abduction.solver.sharing import Backbone
     from ssh_abduction.steps.certificate import Certificate
     from ssh_abduction.theory.speedups import Speedups
     from ssh_abduction.theory.theory import Theory
@@ -26,8 +27,9 @@ _HOMES = {  # module: the names that it exports
     "errors": ("MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "maps": ("DState", "Path", "SSHMap"),
     "online.mapper": ("OnlineMapper",),
-    "solver.result": ("Bound", "Progress", "Solution", "Status"),
+    "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
+    "solver.sharing": ("Backbone",),
     "steps.certificate": ("Certificate",),
     "theory.speedups": ("Speedups",),
     "theory.theory": ("Theory",),
@@ -36,10 +38,12 @@ _HOMES = {  # module: the names that it exports
 
 __all__ = [
     "Action",
+    "Backbone",
     "Bound",
     "Certificate",
     "Cost",
     "DState",
+    "Level",
     "MapError",
     "OnlineMapper",
     "Path",
