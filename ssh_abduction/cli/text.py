@@ -30,7 +30,8 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
     if solution.status is Status.FEASIBLE:
         return f"feasible{why}: {counts}, not proven minimal; any map has {bound or 'no proven bound'}; {seconds}"
     found = counted(solution.levels[0].count if solution.levels else count, "minimal maps") + _levels_above(solution)
-    return f"optimal: {counts}; {found}{'' if solution.complete else f', and there may be more{why}'}; {seconds}"
+    beyond = f" that cost up to {solution.within} more" if solution.minimal_listed else ""
+    return f"optimal: {counts}; {found}{'' if solution.complete else f', and there may be more{beyond}{why}'}; {seconds}"
 
 
 def _levels_above(solution: Solution) -> str:

@@ -359,7 +359,9 @@ class Search:
     def _maps_by_cost(self) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
         """The minimal maps, and behind them those that cost up to `within` more, each with its preferred counts."""
         yield from ((ssh_map, self._known.cost) for ssh_map in self._prefixes.minimal_maps())
-        self._rivals.listed = True
+        self._rivals.listed = True  # so no time is kept for reasoning
+        if not self._most or self.count < self._most:
+            self._watch.end_stage_after(math.inf)
         if self.within and counted_first(self.theory):
             self._prefixes.engine.settle()
             self._near = NearMinimal(self._task, self._judging, self._most, self._report, self._prefixes.engine.asker)
