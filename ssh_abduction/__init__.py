@@ -12,7 +12,9 @@ if TYPE_CHECKING:
 
     from ssh_abduction.engines.base import Cost
     from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
+    from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
     from ssh_abduction.maps import DState, Path, SSHMap
+    from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
@@ -25,7 +27,9 @@ if TYPE_CHECKING:
 _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
     "errors": ("MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
+    "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
     "maps": ("DState", "Path", "SSHMap"),
+    "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
     "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
@@ -43,8 +47,11 @@ __all__ = [
     "Certificate",
     "Cost",
     "DState",
+    "Evaluation",
     "Level",
     "MapError",
+    "MapEvaluation",
+    "Odometry",
     "OnlineMapper",
     "Path",
     "Progress",
@@ -60,6 +67,7 @@ __all__ = [
     "TheoryError",
     "Trace",
     "TraceError",
+    "evaluate",
     "solve",
 ]
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
-from ssh_abduction.errors import MapError, brief, is_writable, named, printable
+from ssh_abduction.errors import MapError, brief, is_finite, is_writable, named, printable
 from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
 from ssh_abduction.trace import View
 
@@ -43,6 +43,44 @@ class DState:
 
 
 @dataclass(frozen=True, slots=True)
+class Pose:
+    """Where a dstate is, as seen from the dstate of the first step.
+
+    x, y     metres; x ahead of the first dstate, y to its left
+    heading  radians, counterclockwise
+    spread   the covariance of x and y, as (xx, xy, yy), in square metres
+    """
+
+    x: float
+    y: float
+    heading: float
+    spread: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How well a map agrees with the displacements of its trace.
+
+    chi2   sum of the squared differences, each divided by its standard deviation
+    dof    degrees of freedom: what chi2 is about, where the map is true and the noise is as the odometry says
+    p      the probability of so large a chi2 or a larger one
+    scale  by which share the displacements are too long
+    bend   by how many radians a metre the heading drifts
+    poses  of the dstates, by id
+    """
+
+    chi2: float
+    dof: int
+    p: float
+    scale: float = 0.0
+    bend: float = 0.0
+    poses: tuple[Pose, ...] = field(default=(), repr=False)
+
+    def to_dict(self) -> dict[str, float]:
+        return {name: round(getattr(self, name), 6) for name in ("chi2", "dof", "p", "scale", "bend")}
+
+
+@dataclass(frozen=True, slots=True)
 class Path:
     """A path: its places in the order in which direction +1 meets them. With path_order=partial this is one of the orders that the map allows."""
 
@@ -57,6 +95,7 @@ class SSHMap:
     labels   the dstate of each step
     links    (dstate, action name, dstate) for each action tried in each dstate
     excused  pairs of paths that the default side_of_branch is not applied to (boundary=defeasible only)
+    fit      how well it agrees with the displacements, where the trace has some and they are used
     """
 
     labels: tuple[int, ...]
@@ -65,6 +104,7 @@ class SSHMap:
     places: tuple[int, ...] = ()
     paths: tuple[Path, ...] = field(default=(), compare=False)
     excused: tuple[tuple[int, int], ...] = field(default=(), compare=False)
+    fit: Fit | None = field(default=None, compare=False)
 
     def without_headings(self) -> SSHMap:
         """The same map for a theory in which places have no frames."""
@@ -122,6 +162,10 @@ class SSHMap:
         }
         if self.excused:
             data["excused"] = [list(pair) for pair in self.excused]
+        if self.fit:
+            data["fit"] = self.fit.to_dict()
+            data["poses"] = [[round(x, 4) for x in (pose.x, pose.y, pose.heading)] for pose in self.fit.poses]
+            data["spreads"] = [[round(x, 4) for x in pose.spread] for pose in self.fit.poses]
         return data
 
     @classmethod
@@ -154,7 +198,7 @@ class SSHMap:
                 raise MapError(f"{where}: labels[{i}]: expected the id of a dstate, got {label}; there are {len(dstates)} dstates")
         links = tuple(read.link(x, ids, f"links[{i}]") for i, x in enumerate(read.list(record, "links")))
         excused = tuple(read.pair(x, f"excused[{i}]") for i, x in enumerate(read.list(record, "excused", optional=True)))
-        return cls(labels, dstates, links, places, paths, excused)
+        return cls(labels, dstates, links, places, paths, excused, read.fit(record, len(dstates)))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the map as JSON. Raises MapError."""
@@ -339,6 +383,30 @@ class _Reader:
         if not good or not is_writable(value[1]) or not {value[0], value[2]} <= ids:
             raise self.wrong(name, "[dstate, action name, dstate]", value)
         return value[0], value[1], value[2]
+
+    def fit(self, record: Mapping[str, Any], dstates: int) -> Fit | None:
+        if record.get("fit") is None:
+            return None
+        found = self.mapping(record["fit"], "fit")
+        chi2, dof, p, scale, bend = (self.number(found.get(name, 0), f"fit.{name}") for name in ("chi2", "dof", "p", "scale", "bend"))
+        rows = [self.numbers(row, f"poses[{i}]") for i, row in enumerate(self.list(record, "poses", optional=True))]
+        spreads = [self.numbers(row, f"spreads[{i}]") for i, row in enumerate(self.list(record, "spreads", optional=True))]
+        for name, listed in (("poses", rows), ("spreads", spreads)):
+            if listed and len(listed) != dstates:
+                raise self.wrong(name, f"{dstates}, one a dstate", len(listed))
+        poses = tuple(Pose(*row, spread) for row, spread in zip(rows, spreads or [(0.0, 0.0, 0.0)] * len(rows), strict=True))
+        return Fit(chi2, int(dof), p, scale, bend, poses)
+
+    def number(self, value: Any, name: str) -> float:
+        if not is_finite(value):
+            raise self.wrong(name, "a finite number", value)
+        return float(value)
+
+    def numbers(self, value: Any, name: str) -> tuple[float, float, float]:
+        if not isinstance(value, list) or len(value) != 3:
+            raise self.wrong(name, "three numbers", value)
+        x, y, z = (self.number(number, name) for number in value)
+        return x, y, z
 
     def pair(self, value: Any, name: str) -> tuple[int, int]:
         if not (isinstance(value, list) and len(value) == 2):

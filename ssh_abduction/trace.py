@@ -23,6 +23,7 @@ from typing import Any, BinaryIO, Literal, TypeAlias
 
 from ssh_abduction.errors import TraceError, brief, is_finite, is_whole, is_writable, named
 from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
+from ssh_abduction.odometry import Covariance, Displacement, Odometry, checked_covariance, checked_displacement
 
 View: TypeAlias = str | int
 Kind: TypeAlias = Literal["travel", "turn"]
@@ -34,7 +35,7 @@ FORMAT, VERSION = "ssh-trace", 1
 LONGEST_LINE = 16 * 2**20
 _KINDS = ("travel", "turn")
 _TURNS = ("right", "left", "around")
-_STEP_FIELDS = ("view", "image", "action", "star", "displacement", "truth")
+_STEP_FIELDS = ("view", "image", "action", "star", "displacement", "covariance", "truth")
 _ACTION_FIELDS = ("name", "kind", "turn")
 
 
@@ -91,7 +92,9 @@ class Step:
 
     view          name or number of the view; None while only an image is there
     star          the openings ahead, right, back and left as four 0/1, or their bearings in degrees, clockwise from ahead
-    displacement  (dx, dy, dtheta) from the last step, in metres and radians, robot frame
+    displacement  (dx, dy, dtheta) from the last step, in metres and radians, in the frame that the robot had there: x ahead, y left, counterclockwise;
+                  that of the first step, which no step comes before, says nothing
+    covariance    of the displacement, (3, 3); where it is missing, the trace's odometry tells it
     image         ranges in metres, or an index into the header's sidecar file
     truth         for evaluation only; nothing that infers reads it
     """
@@ -99,7 +102,8 @@ class Step:
     view: View | None = None
     action: Action | None = None
     star: tuple[float, ...] | None = None
-    displacement: tuple[float, float, float] | None = None
+    displacement: Displacement | None = None
+    covariance: Covariance | None = None
     image: tuple[float, ...] | int | None = None
     truth: Any = field(default=None, hash=False)
     extra: Mapping[str, Any] = field(default_factory=dict, hash=False)
@@ -109,11 +113,28 @@ class Step:
             _view(self.view, "view")
         if self.star is not None:
             _numbers(self.star, "star")
+        if self.displacement is not None:
+            object.__setattr__(self, "displacement", checked_displacement(self.displacement, "displacement"))
+        if self.covariance is not None:
+            if self.displacement is None:
+                raise TraceError("covariance: expected a displacement that it belongs to, got none; add it, or leave the covariance out")
+            object.__setattr__(self, "covariance", checked_covariance(self.covariance, "covariance"))
 
     @staticmethod
-    def of(view: View, star: Sequence[float] | None = None, where: str = "step", action: Action | None = None) -> Step:
-        """A step from a view and perhaps a star. Raises TraceError that says where."""
-        return Step(_view(view, f"{where}: view"), action, None if star is None else _star(star, f"{where}: star"))
+    def of(
+        view: View,
+        star: Sequence[float] | None = None,
+        where: str = "step",
+        action: Action | None = None,
+        displacement: Sequence[float] | None = None,
+        covariance: Sequence[Sequence[float]] | None = None,
+    ) -> Step:
+        """A step from a view, and perhaps a star and a displacement. Raises TraceError that says where."""
+        seen, openings = _view(view, f"{where}: view"), None if star is None else _star(star, f"{where}: star")
+        try:
+            return Step(seen, action, openings, displacement, covariance)  # type: ignore[arg-type]
+        except TraceError as error:
+            raise TraceError(f"{where}: {error}") from None
 
     @property
     def openings(self) -> Openings | None:
@@ -139,6 +160,7 @@ class Step:
             "action": self.action.to_json() if self.action else None,
             "star": list(self.star) if self.star is not None else None,
             "displacement": list(self.displacement) if self.displacement is not None else None,
+            "covariance": [list(row) for row in self.covariance] if self.covariance is not None else None,
             "truth": self.truth,
         }
         return {**{k: v for k, v in known.items() if v is not None}, **self.extra}
@@ -146,11 +168,15 @@ class Step:
 
 @dataclass(frozen=True)
 class Trace:
-    """A sequence of steps: n + 1 observations with n actions between them. It is immutable, and made by `load` or `from_steps`."""
+    """A sequence of steps: n + 1 observations with n actions between them. It is immutable, and made by `load` or `from_steps`.
+
+    odometry  how far displacements that come without a covariance may be off; None for the defaults
+    """
 
     steps: tuple[Step, ...]
     name: str | None = None
     images: str | None = None
+    odometry: Odometry | None = None
     extra: Mapping[str, Any] = field(default_factory=dict, hash=False)
     source: str | None = field(default=None, compare=False)
 
@@ -199,6 +225,18 @@ class Trace:
         """Whether any step carries a star."""
         return any(step.star is not None for step in self.steps)
 
+    @property
+    def has_displacements(self) -> bool:
+        """Whether any step carries a displacement."""
+        return any(step.displacement is not None for step in self.steps)
+
+    def covariance(self, step: int) -> Covariance | None:
+        """The covariance of a step's displacement: the one that it came with, or else by the odometry. None where the step has no displacement."""
+        here = self.steps[step]
+        if here.displacement is None or here.covariance is not None:
+            return here.covariance
+        return (self.odometry or Odometry()).covariance(here.displacement)
+
     def at(self, step: int) -> str:
         """Where a step is, as an error message says it: file and line, or the number of the step."""
         return f"{named(self.source)}:{step + 2}" if self.source else f"step {step}"
@@ -210,9 +248,18 @@ class Trace:
         actions: Iterable[Action | str | Mapping[str, Any]],
         *,
         stars: Iterable[Sequence[float] | None] | None = None,
+        displacements: Iterable[Sequence[float] | None] | None = None,
+        covariances: Iterable[Sequence[Sequence[float]] | None] | None = None,
+        odometry: Odometry | Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> Trace:
-        """A trace from n + 1 views, the n actions between them, and perhaps n + 1 stars. Raises TraceError."""
+        """A trace from n + 1 views, the n actions between them, perhaps n + 1 stars, and perhaps n displacements. Raises TraceError.
+
+        stars          the openings seen at each step, as in Step
+        displacements  [dx, dy, dtheta] of each action, in metres and radians; None where one is not known
+        covariances    of the displacements, (3, 3) each; None where the odometry tells it
+        odometry       how far displacements without a covariance may be off
+        """
         seen, done = _listed(views, "views"), [Action.of(a) for a in _listed(actions, "actions")]
         if len(seen) != len(done) + 1:
             raise TraceError(
@@ -224,15 +271,22 @@ class Trace:
             raise TraceError(
                 f"trace: expected a star a view, got {len(openings)} stars and {len(seen)} views; give None where none was seen"
             )
+        moved, noise = (
+            _of_actions(values, what, len(done)) for values, what in ((displacements, "displacements"), (covariances, "covariances"))
+        )
         steps = tuple(
-            Step.of(view, star, f"step {i}", done[i] if i < len(done) else None)
+            Step.of(view, star, f"step {i}", done[i] if i < len(done) else None, moved[i], noise[i])
             for i, (view, star) in enumerate(zip(seen, openings, strict=True))
         )
-        return cls(steps, name=name)
+        return cls(steps, name=name, odometry=None if odometry is None else Odometry.of(odometry))
 
     def without_stars(self) -> Trace:
         """The same trace, as if no openings had been seen."""
         return replace(self, steps=tuple(replace(step, star=None) for step in self.steps))
+
+    def without_displacements(self) -> Trace:
+        """The same trace, as if the robot had no odometry."""
+        return replace(self, steps=tuple(replace(step, displacement=None, covariance=None) for step in self.steps), odometry=None)
 
     def with_views(self, views: Iterable[View]) -> Trace:
         """This trace with these views, one for each step. Raises TraceError."""
@@ -287,7 +341,8 @@ class Trace:
     def to_lines(self) -> Iterator[str]:
         """The lines of the trace's file: the header, and then a line for each step."""
         header = {"format": FORMAT, "version": VERSION, "name": self.name, "images": self.images}
-        yield _dump({**{k: v for k, v in header.items() if v is not None}, **self.extra})
+        odometry = {} if self.odometry is None else {"odometry": self.odometry.to_json()}
+        yield _dump({**{k: v for k, v in header.items() if v is not None}, **odometry, **self.extra})
         for step in self.steps:
             yield _dump(step.to_json())
 
@@ -340,8 +395,9 @@ def _parse(file: BinaryIO, source: str, path: str) -> Trace:
         )
     if not steps:
         raise TraceError(f"{source}:2: step: expected at least one after the header, got none; add what the robot saw first")
-    extra = {k: v for k, v in header.items() if k not in ("format", "version", "name", "images")}
-    return Trace(tuple(steps), name=header.get("name"), images=header.get("images"), extra=extra, source=path)
+    extra = {k: v for k, v in header.items() if k not in ("format", "version", "name", "images", "odometry")}
+    odometry = header.get("odometry")
+    return Trace(tuple(steps), header.get("name"), header.get("images"), odometry, extra=extra, source=path)
 
 
 def _record(raw: bytes, where: str) -> dict[str, Any]:
@@ -382,7 +438,12 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
     for key in ("name", "images"):
         if not isinstance(record.get(key), str | None):
             raise TraceError(f"{where}: {key}: expected a text, got {brief(record[key])}; quote it or leave it out")
-    return dict(record)
+    if record.get("odometry") is None:
+        return dict(record)
+    try:
+        return {**record, "odometry": Odometry.of(record["odometry"])}
+    except TraceError as error:
+        raise TraceError(f"{where}: {error}") from None
 
 
 def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> Step:
@@ -395,21 +456,22 @@ def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> 
         action = _action(raw, f"{where}: action")
         if not action.extra:
             action = actions.setdefault(action.name, action) if actions.get(action.name, action) == action else action
-    displacement = None
-    if (moved := record.get("displacement")) is not None:
-        numbers = _numbers(moved, f"{where}: displacement")
-        if len(numbers) != 3:
-            raise TraceError(f"{where}: displacement: expected [dx, dy, dtheta], got {brief(moved)}; give metres, metres, radians")
-        displacement = (numbers[0], numbers[1], numbers[2])
-    return Step(
-        view=view,
-        action=action,
-        star=_star(record["star"], f"{where}: star") if record.get("star") is not None else None,
-        displacement=displacement,
-        image=image,
-        truth=record.get("truth"),
-        extra={k: v for k, v in record.items() if k not in _STEP_FIELDS},
-    )
+    star = _star(record["star"], f"{where}: star") if record.get("star") is not None else None
+    extra = {k: v for k, v in record.items() if k not in _STEP_FIELDS}
+    try:
+        return Step(view, action, star, record.get("displacement"), record.get("covariance"), image, record.get("truth"), extra)
+    except TraceError as error:
+        raise TraceError(f"{where}: {error}") from None
+
+
+def _of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[Any]:
+    """For each step, what belongs to the action that led to it, from one value for each action."""
+    listed = [None] * actions if values is None else _listed(values, name)
+    if len(listed) != actions:
+        raise TraceError(
+            f"trace: expected one of {name} for each action, got {len(listed)} and {actions} actions; give None where one is not known"
+        )
+    return [None, *listed]
 
 
 def _listed(values: Any, name: str) -> list[Any]:

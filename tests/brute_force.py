@@ -20,6 +20,8 @@ from collections.abc import Callable, Iterator
 from itertools import combinations, product
 from typing import NamedTuple, TypeAlias
 
+from brute_geometry import Geometry
+
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Action, Openings, Trace
@@ -117,8 +119,11 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
     on = frozenset(theory.axioms)
     defeasible = theory.boundary == "defeasible"
     stars = tuple(step.openings for step in trace)
+    geometry = Geometry(trace, theory) if "one_pose" in on else None
     for labels in _labellings(trace, on):
         if "asserted" in on and not _as_asserted(labels, None, theory):
+            continue
+        if geometry and not geometry.allows(labels, None):
             continue
         dstates = max(labels) + 1
         if theory.level == "causal":
@@ -127,6 +132,8 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
         links = frozenset(zip(labels, trace.actions, labels[1:], strict=False))
         for places in _placings(labels, links, stars, on):
             if "asserted" in on and not _as_asserted(labels, places, theory):
+                continue
+            if geometry and not geometry.allows(labels, places):
                 continue
             headings = list(_headings(labels, places, trace.actions, stars, on)) if theory.star == "frame" else []
             if theory.star == "frame" and not headings:

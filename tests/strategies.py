@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from brute_force import Key
 from hypothesis import strategies as st
 
+from ssh_abduction.odometry import Odometry
 from ssh_abduction.theory.encodings import axioms
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import COUNTS, Count, Theory
@@ -16,6 +18,7 @@ from ssh_abduction.trace import STANDARD_ACTIONS, Action, Trace
 
 ACTIONS = (*STANDARD_ACTIONS.values(), Action("creep", "travel"), Action("veer", "turn", "right"))
 # Few openings, so that stars often agree: all alike, a straight street, a corner, a dead end, a tee.
+ODOMETRY = ({}, {"scale": 0.0, "bend": 0.0}, {"along": 0.2, "heading": 0.02, "bend": 0.0}, {"bend": 0.02, "position": 0.5})
 STARS = ((1, 1, 1, 1), (1, 0, 1, 0), (1, 1, 0, 0), (1, 0, 0, 0), (1, 1, 1, 0))
 
 
@@ -83,7 +86,21 @@ def traces(draw: st.DrawFn, max_steps: int = 7) -> Trace:
         patterns = draw(st.lists(st.sampled_from(STARS), min_size=1, max_size=2))
         rotations = [star[k:] + star[:k] for star in patterns for k in range(4)]
         stars = draw(st.lists(st.sampled_from(rotations), min_size=steps, max_size=steps))
-    return Trace.from_steps(seen, actions, stars=stars)
+    moved = noise = None
+    if draw(st.integers(0, 3)) == 0:
+        wrong = st.tuples(st.sampled_from([-3.0, 0.0, 0.0, 3.0]), st.sampled_from([-3.0, 0.0, 3.0]), st.sampled_from([-0.3, 0.0, 0.3]))
+        moved = [tuple(map(sum, zip(_usual(action), draw(wrong), strict=True))) if draw(st.integers(0, 9)) else None for action in actions]
+        noise = Odometry(**draw(st.sampled_from(ODOMETRY)))
+    return Trace.from_steps(seen, actions, stars=stars, displacements=moved, odometry=noise)
+
+
+def _usual(action: Action) -> tuple[float, float, float]:
+    """What an action does in a world of squares, 10 metres wide."""
+    return (
+        (10.0, 0.0, 0.0)
+        if action.kind != "turn"
+        else (0.0, 0.0, {"right": -math.pi / 2, "left": math.pi / 2}.get(action.turn or "", math.pi))
+    )
 
 
 def _seldom(values: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
@@ -107,6 +124,10 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "next_place": st.booleans(),
         "all_on_paths": st.booleans(),
         "star": st.sampled_from(["auto", "none", "pattern", "frame"] if trace.has_stars else ["auto", "none"]),
+        "displacement": st.sampled_from(["auto", "none", "use"] if trace.has_displacements else ["auto", "none"]),
+        "reject": st.sampled_from([0.001, 0.3]),
+        "joint": st.sampled_from([1, 2]),
+        "returns": st.just(0),
         "prefer": st.permutations(COUNTS).flatmap(lambda order: st.integers(0, len(order)).map(lambda length: order[:length])),
         "without": _seldom(st.sampled_from(LEFT_OUT).map(lambda name: (name,))),
         "rules": _seldom(st.sampled_from(TOYS).map(lambda toy: (toy.rules,))),

@@ -421,7 +421,7 @@ def test_what_programs_read_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["simulate", "notched-rectangle", "--seed", "-1", "-o", "x"], "--seed: expected a number from 0 to"),
-        (["evaluate", "x", "y", "--seed", "1e3"], "--seed: expected a number from 0 to"),
+        (["learning-curve", "x", "y", "--seed", "1e3"], "--seed: expected a number from 0 to"),
         (["cluster", "x", "-o", "y", "--plot", "z.foo"], "--plot: expected a name that ends in .png, .pdf or .svg"),
     ],
 )

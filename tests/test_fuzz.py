@@ -27,7 +27,8 @@ FILES = 2000
 BATCHES = 10  # tests, so that several processes can share the work
 CODES = {0, 1, 2, 10, 20, 30}
 CONTROL = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f]")
-ANSWER = {"solve", "check", "show", "theory", "cluster", "train", "evaluate", "recognise", "simulate"}  # verbs that print no program text
+# Verbs that print no program text.
+ANSWER = {"solve", "check", "show", "theory", "cluster", "train", "learning-curve", "evaluate", "recognise", "simulate"}
 
 WORLD = {
     "format": "ssh-world",
@@ -55,8 +56,9 @@ COMMANDS: dict[str, list[str]] = {
     ],
     "imaged.jsonl": [
         "cluster FILE -o out --k 2",
+        "evaluate imaged-maps.json FILE",
         "train FILE imaged-maps.json -o out",
-        "evaluate FILE imaged-maps.json --folds 2",
+        "learning-curve FILE imaged-maps.json --folds 2",
         "recognise recogniser.skops FILE",
     ],
     "indexed.jsonl": ["recognise recogniser.skops FILE", "cluster FILE -o - --k 2"],
@@ -66,7 +68,8 @@ COMMANDS: dict[str, list[str]] = {
     + 2 * ["check trace.jsonl FILE", "check trace.jsonl FILE --bound"],
     "imaged-maps.json": [
         "train imaged.jsonl FILE -o out",
-        "evaluate imaged.jsonl FILE --folds 2 --json",
+        "evaluate FILE imaged.jsonl --json",
+        "learning-curve imaged.jsonl FILE --folds 2 --json",
         "train imaged.jsonl FILE -o out --map 1",
     ],
     "world.json": ["simulate FILE -o out --no-stars"],

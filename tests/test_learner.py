@@ -227,11 +227,14 @@ def test_from_simulation_to_recognition_in_the_shell(tmp_path: Path, capsys: pyt
     (tmp_path / "maps.json").write_text(capsys.readouterr().out)
     assert main(["train", path("views.jsonl"), path("maps.json"), "-o", path("recogniser.skops")]) == 0
     assert "8 dstates learnt from 80 images" in capsys.readouterr().out
-    assert main(["evaluate", path("views.jsonl"), path("maps.json"), "--json", "--plot", path("curve.png")]) == 0
+    assert main(["evaluate", path("maps.json"), path("views.jsonl")]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith("map 1 is the true one, of 1 map\nthe truth, told at 80 of 80 steps: 8 dstates, 4 places, 4 paths; 14 % of")
+    assert main(["learning-curve", path("views.jsonl"), path("maps.json"), "--json", "--plot", path("curve.png")]) == 0
     curve = json.loads(capsys.readouterr().out)
     assert curve["sizes"][-1] == 80
     assert curve["mean"][-1] > 0.8
-    assert main(["evaluate", path("views.jsonl"), path("maps.json")]) == 0
+    assert main(["learning-curve", path("views.jsonl"), path("maps.json")]) == 0
     assert capsys.readouterr().out.splitlines()[0].split() == ["images", "recognised", "worst", "fold", "best", "fold"]
     assert main(["simulate", "notched-rectangle", "--tours", "2", "--seed", "4", "-o", path("other.jsonl")]) == 0
     capsys.readouterr()

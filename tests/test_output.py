@@ -113,7 +113,7 @@ def test_a_closed_pipe_and_a_ring_of_links_are_errors(tmp_path: Path, capsys: py
 
 
 @pytest.mark.parametrize(
-    "words", ["simulate notched-rectangle", "cluster x", "train x y", "reproduce notched-rectangle --seeds 0", "evaluate x y --plot"]
+    "words", ["simulate notched-rectangle", "cluster x", "train x y", "reproduce notched-rectangle --seeds 0", "learning-curve x y --plot"]
 )
 def test_no_name_is_no_file(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
@@ -122,7 +122,7 @@ def test_no_name_is_no_file(words: str, capsys: pytest.CaptureFixture[str]) -> N
 
 
 @pytest.mark.parametrize(
-    "words", ["train x y -o=--", "evaluate x y --folds=--", "show x --map=--", "solve x --rules=--", "check x y --prefer=--"]
+    "words", ["train x y -o=--", "learning-curve x y --folds=--", "show x --map=--", "solve x --rules=--", "check x y --prefer=--"]
 )
 def test_two_dashes_are_no_value(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
@@ -143,7 +143,7 @@ def test_every_verb_that_writes_writes_into_a_pipe(tmp_path: Path, capsys: pytes
         ["simulate", "notched-rectangle", "--route", "right", "-o"],
         ["cluster", str(run), "--k", "4", "-o"],
         ["train", str(views), str(maps), "-o"],
-        ["evaluate", str(views), str(maps), "--map", "1", "--folds", "2", "--plot"],
+        ["learning-curve", str(views), str(maps), "--map", "1", "--folds", "2", "--plot"],
     ):
         pipe, got = tmp_path / "pipe.png", []
         os.mkfifo(pipe)
@@ -159,14 +159,14 @@ def test_every_verb_that_writes_writes_into_a_pipe(tmp_path: Path, capsys: pytes
 
 @pytest.fixture
 def learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """The words of `evaluate` for a small trace with images and its map."""
+    """The words of `learning-curve` for a small trace with images and its map."""
     lines = [{"format": "ssh-trace", "version": 1}]
     lines += [{"view": "ab"[i % 2], "image": [1.0 + i % 2, 2.0 + i / 100], "action": "travel"} for i in range(8)]
     del lines[-1]["action"]
     (tmp_path / "t.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert main(["solve", str(tmp_path / "t.jsonl"), "--theory", "causal", "--json"]) == 0
     (tmp_path / "m.json").write_text(capsys.readouterr().out)
-    return ["evaluate", str(tmp_path / "t.jsonl"), str(tmp_path / "m.json"), "--folds", "2"]
+    return ["learning-curve", str(tmp_path / "t.jsonl"), str(tmp_path / "m.json"), "--folds", "2"]
 
 
 def test_matplotlib_is_looked_for_before_anything_is_done(

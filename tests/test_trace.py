@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from ssh_abduction import Action, Step, Trace, TraceError
 from ssh_abduction import trace as trace_module
+from ssh_abduction.odometry import Odometry
 
 HEADER = '{"format": "ssh-trace", "version": 1}'
 STEP = '{"view": "a", "action": "travel"}'
@@ -110,6 +112,36 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "star of texts": ([HEADER, '{"view": "a", "star": ["n"]}'], "2: star[0]: expected a finite number"),
     "star with equal bearings": ([HEADER, '{"view": "a", "star": [10, 370]}'], "2: star: expected four 0/1"),
+    "displacement in millimetres": (
+        [HEADER, '{"view": "a", "displacement": [5000, 0, 0]}'],
+        "2: displacement: expected metres, at most 1,000",
+    ),
+    "displacement in degrees": ([HEADER, '{"view": "a", "displacement": [5, 0, 90]}'], "2: displacement[2]: expected radians"),
+    "covariance without displacement": (
+        [HEADER, '{"view": "a", "covariance": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}'],
+        "2: covariance: expected a displacement",
+    ),
+    "covariance not positive": (
+        [HEADER, '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 2, 0], [2, 1, 0], [0, 0, 1]]}'],
+        "2: covariance: expected a positive definite matrix",
+    ),
+    "covariance not symmetric": (
+        [HEADER, '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}'],
+        "2: covariance: expected a symmetric matrix",
+    ),
+    "covariance of two rows": (
+        [HEADER, '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 0, 0], [0, 1, 0]]}'],
+        "2: covariance: expected three rows",
+    ),
+    "covariance with a text": (
+        [HEADER, '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 0, 0], [0, "x", 0], [0, 0, 1]]}'],
+        "2: covariance[1][1]: expected a finite number",
+    ),
+    "odometry no object": (['{"format": "ssh-trace", "version": 1, "odometry": 3}'], "1: odometry: expected an object"),
+    "odometry negative": (
+        ['{"format": "ssh-trace", "version": 1, "odometry": {"along": -1}}'],
+        "1: odometry.along: expected a number from 0",
+    ),
     "displacement of two": ([HEADER, '{"view": "a", "displacement": [1, 2]}'], "2: displacement: expected [dx, dy, dtheta]"),
     "negative index": ([HEADER, '{"image": -1}'], "2: image: expected an index"),
     "broken JSON": ([HEADER, STEP, '{"view": "b"'], "3: line: expected one JSON object, got broken JSON at column 13"),
@@ -269,3 +301,34 @@ def test_an_action_prints_and_compares() -> None:
     assert Action.of("travel") == Action("travel", "travel")
     assert Action.of({"name": "left", "kind": "turn"}).turn == "left"
     assert Action.of(Action("x")) == Action("x")
+
+
+def test_displacements_and_odometry_survive_a_round_trip(tmp_path: Path) -> None:
+    noise = [[0.5, 0.1, 0.0], [0.1, 0.2, 0.0], [0.0, 0.0, 0.01]]
+    trace = Trace.from_steps(
+        "aab",
+        ["travel", "right"],
+        displacements=[(10, 0.5, 0.1), None],
+        covariances=[noise, None],
+        odometry={"along": 0.1, "colour": "red"},
+    )
+    trace.save(tmp_path / "t.jsonl")
+    again = Trace.load(tmp_path / "t.jsonl")
+    assert again == trace
+    assert again.steps[1].displacement == (10.0, 0.5, 0.1)
+    assert again.covariance(1) == tuple(map(tuple, noise))
+    assert again.covariance(2) is None
+    assert again.odometry is not None
+    assert (again.odometry.along, again.odometry.across) == (0.1, 0.02)
+    assert again.odometry.to_json()["colour"] == "red"
+    assert '"odometry"' not in "".join(trace.without_displacements().to_lines())
+
+
+def test_covariance_follows_the_way_of_a_step() -> None:
+    odometry = Odometry(along=0.1, across=0.01, heading=0.01, turning=0.1, position=0.0, angle=0.0)
+    (xx, xy, _), (_, yy, _), (_, _, heading) = odometry.covariance((0.0, 10.0, math.pi / 2))  # to the left
+    assert (xx, xy, yy) == pytest.approx((0.01, 0.0, 1.0), abs=1e-5)
+    assert heading == pytest.approx(0.01 + (0.1 * math.pi / 2) ** 2, abs=1e-5)
+    (xx, xy, _), _, _ = odometry.covariance((6.0, 8.0, 0.0))  # along and across are turned to the way
+    assert xx == pytest.approx(0.6**2 * 1.0 + 0.8**2 * 0.01, abs=1e-5)
+    assert xy == pytest.approx((1.0 - 0.01) * 0.6 * 0.8, abs=1e-5)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from itertools import pairwise, permutations
+from itertools import pairwise, permutations, product
 from typing import TypeAlias
 
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
@@ -84,9 +84,9 @@ def _evidence_facts(trace: Trace, theory: Theory, start: int, stop: int) -> Iter
     for evidence in evidence_of(theory):
         pairs = evidence.pairs(trace)
         for t in range(start, stop) if pairs else ():
-            yield from (f"excluded({evidence.name},{i},{t})." for i in pairs.apart.get(t, ()))
+            yield from (f"excluded({evidence.axiom},{i},{t})." for i in pairs.apart.get(t, ()))
             if theory.level == "topological":
-                yield from (f"elsewhere({evidence.name},{i},{t})." for i in pairs.elsewhere.get(t, ()))
+                yield from (f"elsewhere({evidence.axiom},{i},{t})." for i in pairs.elsewhere.get(t, ()))
             yield from (f"one({i},{t})." for i in pairs.one.get(t, ()))
         yield evidence.facts(trace, start, stop)
 
@@ -374,6 +374,11 @@ def forbidden_pairs(
     return f":- {', '.join(['#true', *body] if listed is None else [f'listed({listed})', *body])}."
 
 
+def forbidden_places(equalities: Sequence[Sequence[tuple[int, int, int]]]) -> str:
+    """The rules that not all of these equalities hold, each of which is that one of some pairs of visits is one place, however turned."""
+    return "\n".join(forbidden_pairs(pairs) for pairs in product(*equalities))
+
+
 def forbidden_equalities(equalities: Iterable[Equality]) -> str:
     """The rule that these equalities of steps do not all hold."""
     atoms = [f"same{'' if e.of == 'dstate' else '_place'}({min(e.first, e.second)},{max(e.first, e.second)})" for e in equalities]
@@ -451,14 +456,22 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
     return SSHMap(found, tuple(DState(i, _view(trace, t)) for i, t in enumerate(first)), links_of(found, trace))
 
 
-def paths_framed_facts(trace: Trace, theory: Theory, chart: FramedChart) -> str:
-    """What happened at the nodes of a chart, as facts for paths_framed.lp."""
+def paths_framed_facts(trace: Trace, theory: Theory, chart: FramedChart, forbidden: Sequence[Collection[Equality]] = ()) -> str:
+    """What happened at the nodes of a chart, as facts for paths_framed.lp.
+
+    forbidden  sets of equalities of steps that do not all hold
+    """
     facts = [f"rotated({s},{x},{-action})." for s, action, x in chart.links if action < 0]
     facts += [f"travelled({s},{x})." for s, _, x in chart.travels]
     facts += [f"turned({s},{turn},{x})." for s, turn, x in chart.turns(trace)]
     facts += [f"excluded({s},{x})." for s, x in chart.excluded]
     visits = {(chart.facing[s][0], chart.facing[x][0]): (s, x) for s, x in chart.away}
     facts += [f"far_nodes({s},{x})." for s, x in visits.values()]
+    steps = len(chart.node_of)
+    for number, equalities in enumerate(forbidden):
+        if all(max(equality.first, equality.second) < steps for equality in equalities):
+            nodes = [(chart.node_of[equality.first], chart.node_of[equality.second], equality.of) for equality in equalities]
+            facts += [f"part({number},{k},{s},{x},{of})." for k, (s, x, of) in enumerate(nodes)]
     return "\n".join([*facts, sides_framed_facts(theory)])
 
 

@@ -82,6 +82,8 @@ def ending(
         end["stopped"] = solution.stopped
     if solution.partial:
         end["partial"] = solution.partial.to_dict()
+    if solution.evidence:
+        end["evidence"] = {name: dict(said) for name, said in solution.evidence.items()}
     if found := warnings_of(search, solution):
         end["warnings"] = found
     if explanation:
@@ -93,7 +95,8 @@ def warnings_of(search: Search, solution: Solution) -> list[str]:
     """What makes the trace suspicious, a sentence each."""
     if solution.stopped == "interrupted" and len(search.trace) > SOON:
         return []
-    return [solution.noise.sentence(search.trace)] if solution.noise else []
+    noise = [solution.noise.sentence(search.trace)] if solution.noise else []
+    return noise + ([solution.odometry_warning] if solution.odometry_warning else [])
 
 
 def warn(warnings: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, on_ctrl_c, opening, told, warn, warnings_of
-from ssh_abduction.cli.text import describe, describe_backbone, differences, headline
+from ssh_abduction.cli.text import by_displacements, describe, describe_backbone, differences, headline
 from ssh_abduction.explain import Explanation
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.result import Progress, Solution, Status, summary_of
@@ -166,6 +166,7 @@ def _text(lines: Iterator[str]) -> str:
 
 def _lines(search: Search, solution: Solution, explanation: Explanation | None, backbone: Backbone | None) -> Iterator[str]:
     yield headline(solution, search.count, explanation)
+    yield from by_displacements(solution)
     if solution.status is Status.UNSATISFIABLE:
         if explanation:
             first, last = search.trace.at(explanation.first), search.trace.at(explanation.last)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 
 from ssh_abduction.errors import printable
 from ssh_abduction.explain import Explanation
@@ -39,6 +40,25 @@ def _levels_above(solution: Solution) -> str:
     return "".join(
         f"; {level.count} with {', '.join(counted(v, k) for k, v in level.cost.to_dict().items())}" for level in solution.levels[1:]
     )
+
+
+def by_displacements(solution: Solution) -> Iterator[str]:
+    """What displacements excluded, and how well the maps close by them; nothing where they are not used."""
+    said = solution.evidence.get("displacement")
+    if said is None:
+        return
+    sets = f" and {counted(said['refused'], 'sets')} of two returns" if said["refused"] else ""
+    text = f"displacements: they exclude {counted(said['pairs'], 'pairs')} of steps{sets}"
+    best = solution.maps[0].fit if solution.maps else None
+    if best is not None:
+        which = "the map closes" if solution.count == 1 else "map 1, which closes best, does so"
+        text += f"; {which} with a chi-square of {best.chi2:.1f} for {best.dof} degrees of freedom (p = {best.p:.2g})"
+        if best.scale or best.bend:
+            text += f", scale off by {100 * best.scale:+.1f} %, headings drift by {math.degrees(best.bend):+.3f} degrees a metre"
+    yield text
+    weights = solution.weights
+    if len(weights) > 1:
+        yield f"weights of the maps by displacements alone: {', '.join(f'{weight:.2g}' for weight in weights)}"
 
 
 def counted(number: int, things: str) -> str:

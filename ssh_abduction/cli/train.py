@@ -1,4 +1,4 @@
-"""ssh-abduction train, evaluate, recognise: the map's labels teach a recogniser, which then knows a dstate from one image."""
+"""ssh-abduction train, learning-curve, recognise: the map's labels teach a recogniser, which then knows a dstate from one image."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def add_parser(verbs: Verbs) -> None:
     train.add_argument("-o", "--output", type=output, required=True, metavar="FILE.skops", help="file to write")
     train.set_defaults(run=run_train)
     text = "Recognition rate by 10-fold cross-validation, against the number of images, on the labels that a map gives."
-    evaluate = verbs.add_parser("evaluate", help="learning curve of a recogniser", description=text)
-    evaluate.add_argument("--folds", type=int, default=10, help="parts of the cross-validation (default: 10)")
-    evaluate.add_argument("--seed", type=seed, default=0, help="seed of the folds (default: 0)")
-    evaluate.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the learning curve")
-    evaluate.add_argument("--json", action="store_true", help="print JSON")
-    evaluate.set_defaults(run=run_evaluate)
-    for parser in (train, evaluate):
+    curve = verbs.add_parser("learning-curve", help="how well a recogniser does with few and many images", description=text)
+    curve.add_argument("--folds", type=int, default=10, help="parts of the cross-validation (default: 10)")
+    curve.add_argument("--seed", type=seed, default=0, help="seed of the folds (default: 0)")
+    curve.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the learning curve")
+    curve.add_argument("--json", action="store_true", help="print JSON")
+    curve.set_defaults(run=run_learning_curve)
+    for parser in (train, curve):
         parser.add_argument("trace", help="trace file with images")
         parser.add_argument("maps", help="what solve --json printed for this trace, or one saved map")
         parser.add_argument("--map", type=int, metavar="I", help="take the I-th map, from 1 (default: the labels all maps agree on)")
@@ -70,7 +70,7 @@ def run_train(options: argparse.Namespace) -> int:
     return 0
 
 
-def run_evaluate(options: argparse.Namespace) -> int:
+def run_learning_curve(options: argparse.Namespace) -> int:
     from perception.recognition import learning_curve
 
     check_picture(options.plot)

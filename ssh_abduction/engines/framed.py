@@ -114,6 +114,7 @@ class FramedEngine:
         self._visits = VisitLabels(task, self.asker, self._charted, self._sides)
         self._unframed_size = 0  # how many steps there are where they fit no frames
         self._framed = True  # whether the visits fit their frames
+        self._forbidden: list[Collection[Equality]] = []  # what evidence found out cannot all hold
         self._forget()
 
     def _forget(self) -> None:
@@ -137,7 +138,8 @@ class FramedEngine:
 
     @property
     def _paths(self) -> Paths:
-        return Paths(self._task.trace, self._task.theory, pinned=self._task.speedups.clique, check=self.asker.watch.check)
+        pinned, check = self._task.speedups.clique, self.asker.watch.check
+        return Paths(self._task.trace, self._task.theory, pinned=pinned, check=check, forbidden=tuple(self._forbidden))
 
     def with_paths(self, paths: int) -> FramedEngine:
         return FramedEngine(self._task, self._around, self._soon)
@@ -449,12 +451,11 @@ class FramedEngine:
             self._visits.forbid(labels, self._clashing(labels))
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
-        if any(equality.of == "place" for equality in equalities):
-            return False
         self._end_beside()
         self._best, self._named, self._tried = None, None, None
-        node_of = self._chart.node_of
-        self._visits.forbid_together([(node_of[equality.first], node_of[equality.second]) for equality in equalities])
+        self._forbidden.append(equalities)
+        nodes = [(self._chart.node_of[equality.first], self._chart.node_of[equality.second], equality.of) for equality in equalities]
+        self._visits.forbid_together([(a, b) for a, b, of in nodes if of == "dstate"], [(a, b) for a, b, of in nodes if of == "place"])
         return True
 
     def _clashing(self, labels: Sequence[int]) -> list[list[int]]:

@@ -38,6 +38,7 @@ from ssh_abduction.guesses.merging import Told, first_failing, kept, merged_as_t
 from ssh_abduction.steps.apart import Matrix, large_clique
 from ssh_abduction.steps.chart import FramedChart
 from ssh_abduction.steps.localising import faced, states_of, tracked
+from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
@@ -60,28 +61,38 @@ LOOSENED = 2
 class Paths:
     """The axioms of places and paths, for charts of one trace.
 
-    pinned  whether segments no two of which can be one path are named as paths beforehand
-    check   called now and then while clingo grounds; may raise. A process that is sent these questions has its own, so this does not go along
+    pinned     whether segments no two of which can be one path are named as paths beforehand
+    check      called now and then while clingo grounds; may raise. A process that is sent these questions has its own, so this does not go along
+    forbidden  sets of equalities of steps that do not all hold, as evidence found out
     """
 
-    def __init__(self, trace: Trace, theory: Theory, *, pinned: bool = True, check: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        trace: Trace,
+        theory: Theory,
+        *,
+        pinned: bool = True,
+        check: Callable[[], None] = lambda: None,
+        forbidden: Sequence[Collection[Equality]] = (),
+    ) -> None:
         self._trace = trace
         self._theory = theory
         self._pinned = pinned
+        self._forbidden = forbidden
         self._check = check
 
     def __reduce__(self) -> tuple[Callable[..., Paths], tuple[Trace, Theory]]:
-        return partial(Paths, pinned=self._pinned), (self._trace, self._theory)
+        return partial(Paths, pinned=self._pinned, forbidden=self._forbidden), (self._trace, self._theory)
 
     def _under(self, check: Callable[[], None]) -> Paths:
         """The same questions, which these limits end."""
-        return Paths(self._trace, self._theory, pinned=self._pinned, check=check)
+        return Paths(self._trace, self._theory, pinned=self._pinned, check=check, forbidden=self._forbidden)
 
     def control(self, chart: FramedChart, options: Sequence[str] = ()) -> Control:
         """A control with these axioms, and what happened; nothing is grounded yet."""
         control = Control(options, self._check, PREPARING)
         control.load_encodings("paths_framed")
-        control.add("base", [], facts.paths_framed_facts(self._trace, self._theory, chart))
+        control.add("base", [], facts.paths_framed_facts(self._trace, self._theory, chart, self._forbidden))
         return control
 
     def contrary(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:

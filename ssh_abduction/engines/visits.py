@@ -498,16 +498,25 @@ class VisitLabels:
                 rules.append(facts.forbidden_pairs(together, different))
         self._tell("\n".join(rules))
 
-    def forbid_together(self, pairs: Collection[tuple[int, int]]) -> None:
-        """From now on these pairs of nodes are not all one dstate."""
+    def forbid_together(self, pairs: Collection[tuple[int, int]], places: Collection[tuple[int, int]] = ()) -> None:
+        """From now on these pairs of nodes are not all one dstate, while those are at one place.
+
+        Labels alone do not tell which nodes are at one place. So where places are given, labels that were found stay, and whoever seeks their paths finds out.
+        """
         self.has_forbidden = True
         facing = self.chart.facing
         apart = [(a, b) for a, b in pairs if a != b]
-        if unknown := {facing[node][0] for pair in apart for node in pair} - self._visits:
+        away = [(a, b) for a, b in places if facing[a][0] != facing[b][0]]
+        if unknown := {facing[node][0] for pair in (*apart, *away) for node in pair} - self._visits:
             self._give_more(unknown)
-        together = [self._pair(a, b) for a, b in apart]
-        if self._fits.issuperset(together):
-            self._tell(facts.forbidden_pairs(together))
+        choices = [[pair] for a, b in apart if (pair := self._pair(a, b)) in self._fits]
+        for a, b in away:
+            (i, _), (j, _) = sorted((facing[a], facing[b]))
+            choices.append([(i, j, turned) for turned in range(4) if (i, j, turned) in self._fits])
+        if len(choices) == len(apart) + len(away):  # else they are apart by now
+            self._tell(facts.forbidden_places(choices))
+        if away:
+            return
 
         def is_left(labels: Sequence[int]) -> bool:
             return any(labels[a] != labels[b] for a, b in apart)

@@ -811,6 +811,19 @@ def _asserted(m: _Reading) -> Found:
             yield [i, j], f"Steps {i} and {j} are at one place, {min(places, key=str)}, but are said to be {said}."
 
 
+def _one_pose(m: _Reading) -> Found:
+    """A dstate has one pose, a place one position, with which the displacements agree within their covariance."""
+    from ssh_abduction.judge.geometry import refused_returns  # loads numpy
+
+    for refused in refused_returns(m.trace, m.map, m.theory):
+        said = " and ".join(f"steps {i} and {j} are at one {'place' if freedom == 2 else 'dstate'}" for i, j, freedom in refused.returns)
+        steps = [t for i, j, _ in refused.returns for t in (i, j)]
+        yield (
+            steps,
+            f"By the displacements it cannot be that {said}: chi-square {refused.square:.0f}, and at most {refused.most:.0f} is allowed.",
+        )
+
+
 AXIOMS: dict[str, Check] = {
     "functional_view": _functional_view,
     "deterministic": _deterministic,
@@ -842,4 +855,5 @@ AXIOMS: dict[str, Check] = {
     "one_dstate_per_heading": _one_dstate_per_heading,
     "path_goes_straight": _path_goes_straight,
     "asserted": _asserted,
+    "one_pose": _one_pose,
 }

@@ -29,6 +29,7 @@ from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.sharing import Backbone, Sharing
 from ssh_abduction.steps.log import Outcome, Replay
+from ssh_abduction.theory.evidence import Equality
 
 # Without these axioms a dstate may be at several places, or along several courses, of which a map shows one.
 SHOWN_ONCE = frozenset({"one_place", "one_course"})
@@ -106,8 +107,9 @@ class _Reasoning:
 
     def settle_labels(self, engine: Engine) -> bool:
         """Take in maps, for each labels of minimal maps, until nothing is in doubt. Returns False where that cannot be done with this engine."""
+        forbidden = set[frozenset[Equality]]()
         while (labellings := engine.labellings(self._cost)) is not None:
-            failed = 0
+            failed, refused = 0, None
             for settled in labellings:
                 found = settled.any_map()
                 while found is not None:
@@ -115,14 +117,21 @@ class _Reasoning:
                     if replayed.outcome is not Outcome.PREDICTED:
                         failed = len(replayed.labels)
                         break
-                    if not self._take_in(found, replayed):
-                        return False
+                    if refused := self._judging.why_refused(replace(found, labels=replayed.labels)):
+                        break
+                    self._sharing.absorb(replace(found, labels=replayed.labels))
                     found = self._differing_map(settled, replayed.labels)
-                if failed:
+                if failed or refused:
                     break
-            if not failed:
+            if refused:
+                of_prefix = all(max(equality.first, equality.second) < engine.size for equality in refused)
+                if refused in forbidden or not of_prefix or not engine.forbid(refused):
+                    return False
+                forbidden.add(refused)
+            elif failed:
+                engine.grow(engine.next_size(failed))
+            else:
                 return True
-            engine.grow(engine.next_size(failed))
         return False
 
     def _differing_map(self, settled: Settled, labels: Sequence[int]) -> SSHMap | None:
@@ -130,14 +139,6 @@ class _Reasoning:
         return settled.map_with(
             [(sort, labels[i], labels[j], one) for sort, i, j, one in self._doubts_of_classes(len(labels)) if sort != "dstates"]
         )
-
-    def _take_in(self, found: SSHMap, replayed: Replay) -> bool:
-        """Take in a map that replays to the end, unless evidence refuses it. Says whether it was so."""
-        whole = replace(found, labels=replayed.labels)
-        if self._judging.why_refused(whole):
-            return False
-        self._sharing.absorb(whole)
-        return True
 
     def settle_steps(self) -> None:
         """Take in maps until nothing is in doubt, where the readable encodings are asked."""
@@ -167,8 +168,8 @@ class _Reasoning:
         engine.grow(size)
         while (found := engine.map_with(list(self._doubts(size)), self._cost)) is not None:
             replayed = self._replay(found)
-            equalities = self._judging.why_refused(found) or self._judging.why_refused(replace(found, labels=replayed.labels))
-            if equalities:
+            whole = replace(found, labels=replayed.labels)
+            if equalities := self._judging.why_refused(found) or self._judging.why_refused(whole):
                 last = max(max(equality.first, equality.second) for equality in equalities)
                 if last >= size:
                     return engine.next_size(last)
@@ -176,7 +177,7 @@ class _Reasoning:
             elif replayed.outcome is not Outcome.PREDICTED:
                 return engine.next_size(len(replayed.labels))
             else:
-                self._take_in(found, replayed)
+                self._sharing.absorb(whole)
         replayed = self._task.log.replay(self._sharing.classes[:size])
         return 0 if replayed.outcome is Outcome.PREDICTED else engine.next_size(len(replayed.labels))
 

@@ -51,7 +51,14 @@ class Judging:
 
     def why_refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
         """Equalities of a map, of the trace or a prefix, that some evidence finds out cannot all hold; None where it refuses none."""
-        return next((found for evidence in self._evidence if (found := evidence.refuse(self._trace, ssh_map))), None)
+        return next(iter(self.refusals(ssh_map).values()), None)
+
+    def refusals(self, ssh_map: SSHMap) -> dict[str, frozenset[Equality]]:
+        """The same, of the first kind of evidence that refuses the map, by its name."""
+        for evidence in self._evidence:
+            if found := evidence.refuse(self._trace, ssh_map):
+                return {evidence.name: found}
+        return {}
 
     def accepts(self, ssh_map: SSHMap) -> bool:
         """Whether a map of the whole trace that nothing proves yet is known to satisfy all axioms."""

@@ -23,6 +23,7 @@ class Known:
     stopped   why the search ended before it was complete, if it did
     complete  whether no further minimal map exists
     count     how many minimal maps were given
+    refused   how many sets of equalities each kind of evidence refused
     """
 
     def __init__(self, theory: Theory) -> None:
@@ -35,6 +36,7 @@ class Known:
         self.stopped: Stop | None = None
         self.complete = False
         self.count = 0
+        self.refused: dict[str, int] = {}
         self._theory = theory
 
     def is_better(self, found: Found) -> bool:

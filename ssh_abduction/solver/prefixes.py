@@ -71,7 +71,14 @@ class Prefixes:
 
     def minimise(self) -> Found | None:
         """A minimal map of the prefix that no evidence refuses, or None where it has no map."""
-        return first_accepted(self._minimise_as_told, lambda found: self._judging.why_refused(found.map), self._forbid)
+
+        def why_refused(found: Found) -> frozenset[Equality] | None:
+            for name, equalities in self._judging.refusals(found.map).items():
+                self._known.refused[name] = self._known.refused.get(name, 0) + 1
+                return equalities
+            return None
+
+        return first_accepted(self._minimise_as_told, why_refused, self._forbid)
 
     def _forbid(self, equalities: frozenset[Equality]) -> None:
         """Let no map have all of these equalities; where the engine cannot be told, another one goes on that can."""

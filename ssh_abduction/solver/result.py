@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
@@ -10,6 +11,7 @@ from ssh_abduction.asp.limits import Stop
 from ssh_abduction.engines.base import Cost, cost_as_counted
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.backbone import Rivals
+from ssh_abduction.solver.ranking import weights
 from ssh_abduction.solver.sharing import Backbone, Sharing
 from ssh_abduction.steps.certificate import Basis, Certificate
 from ssh_abduction.steps.noise import LEAST, Noise
@@ -97,6 +99,8 @@ class Solution:
     within     how many dstates more than the least a map may have to be listed
     levels     how many minimal maps were given and, with `within`, how many that have more dstates: a level for each number of them that some map has
     rivals     what the backbone is worked out from; where there is none, it is worked out from the maps listed
+    evidence   for each kind of evidence that took part: how many pairs of steps it excluded, and how many sets of equalities it refused
+    odometry_warning  what is wrong with the noise that the odometry claims, if the best map shows that
     """
 
     status: Status
@@ -111,6 +115,8 @@ class Solution:
     basis: Basis | None = field(default=None, repr=False)
     stopped: Stop | None = None
     partial: SSHMap | None = None
+    evidence: Mapping[str, Mapping[str, int]] = field(default_factory=dict, hash=False)
+    odometry_warning: str | None = None
     within: int = 0
     levels: tuple[Level, ...] = ()
     rivals: Rivals | None = field(default=None, repr=False, compare=False)
@@ -146,6 +152,11 @@ class Solution:
     def summary(self) -> str:
         """What the answer is, in one sentence: how many minimal maps there are, what all of them share, and in which steps they differ."""
         return summary_of(self, self.count, self.backbone)
+
+    @property
+    def weights(self) -> tuple[float, ...]:
+        """How likely each of the maps is, among these, as displacements alone say; empty where they are not used."""
+        return weights(self.maps)
 
     @property
     def certificate(self) -> Certificate | None:

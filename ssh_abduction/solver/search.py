@@ -43,6 +43,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from itertools import groupby
 from typing import Any
 
 from ssh_abduction.asp import facts
@@ -60,9 +61,11 @@ from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.solver.ranking import Ranking, noise_warning
 from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solution, Status
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.steps.certificate import Basis
+from ssh_abduction.theory.evidence import evidence_of
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Trace, checked_trace
@@ -152,14 +155,15 @@ class Search:
         check_rules(self.theory)
         self.trace = trace
         self._begun = False
+        self._first: SSHMap | None = None  # of the maps that were given
         self._basis: Basis | None = None  # of the certificate of the whole trace, where the search was stopped
         self._most = maps
         self.within = int(within)
         self._near: NearMinimal | None = None  # what lists maps that cost more than the least, once these are listed
         self._levels: list[Level] = []
         self._reasons = reasons
-        self._cost: tuple[int, ...] = ()  # of the map that was given last: the preferred counts
-        self._last: SSHMap | None = None  # that was given
+        self._cost: tuple[int, ...] = ()  # of the map that was found last: the preferred counts
+        self._last: tuple[SSHMap, tuple[int, ...]] | None = None  # the map that was given last, and its preferred counts
         self._goes_on = after is not None
         self._asked_speedups = checked_speedups(speedups)
         self._on_progress = on_progress
@@ -241,7 +245,7 @@ class Search:
     @property
     def cost(self) -> Cost | None:
         """What the map costs that was given last."""
-        return None if self._last is None else cost_as_counted(self._last, self._cost, self.theory)
+        return None if self._last is None else cost_as_counted(*self._last, self.theory)
 
     @property
     def backbone(self) -> Backbone | None:
@@ -264,6 +268,21 @@ class Search:
         return self._near.engine if self._near else self._prefixes.engine
 
     def __iter__(self) -> Iterator[SSHMap]:
+        ranking = Ranking(self.trace) if self.theory.displacement == "use" else None
+        for cost, level in groupby(self._found(), key=lambda _: self._cost):
+            for ssh_map in ranking.ranked(level, self.over) if ranking else level:
+                self._take_down(ssh_map, cost)
+                yield ssh_map
+
+    def _take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
+        """Remember the map that is given, and count it at its level."""
+        self._first, self._last = self._first or ssh_map, (ssh_map, cost)
+        if not self._levels or self._levels[-1].cost.preferred_by(self.theory) != cost:
+            self._levels.append(Level(cost_as_counted(ssh_map, cost, self.theory), 0))
+        self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
+
+    def _found(self) -> Iterator[SSHMap]:
+        """The maps, level by level, in the order in which they are found; or the best one known."""
         if self._begun:
             raise SolverError("search: expected to be iterated once, got a second time; make another Search")
         self._begun = True
@@ -346,7 +365,7 @@ class Search:
                 # The first map is the best one: so the cost is its, also in the counts that the theory does not prefer.
                 self._known.best = self.best if self.count else ssh_map
                 self._known.count += 1
-                self._take_down(ssh_map, cost)
+                self._note(ssh_map, cost)
                 self._report()
                 self._watch.stop()
                 yield ssh_map
@@ -367,15 +386,11 @@ class Search:
             self._near = NearMinimal(self._task, self._judging, self._most, self._report, self._prefixes.engine.asker)
             yield from self._near.maps(self._known.cost, self.within)
 
-    def _take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-        """Remember the map that is given, and count it at its level."""
-        begins = not self._levels or cost != self._cost
-        self._last, self._cost = ssh_map, cost
+    def _note(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
+        """Note what a map costs that is found, and what it shares with the others."""
+        self._cost = cost
         if self.status is Status.OPTIMAL and cost == self._known.cost:
             self._rivals.add(ssh_map, cost)
-        if begins:
-            self._levels.append(Level(cost_as_counted(ssh_map, cost, self.theory), 0))
-        self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
 
     def _end_clingo(self) -> None:
         """End what is still under way, and take the bound that it leaves."""
@@ -415,7 +430,7 @@ class Search:
         if self.status in (Status.FEASIBLE, Status.OPTIMAL) and not self.count and self.best is not None:
             self._judging.pass_map(self.best, self.prefix, self._watch.elapsed())
             self._known.count = 1
-            self._take_down(self.best, self._known.cost)
+            self._note(self.best, self._known.cost)
             yield self.best
 
     def _reason(self) -> None:
@@ -453,7 +468,7 @@ class Search:
         return Solution(
             status=self.status,
             maps=maps,
-            cost=self._known.best_cost,
+            cost=self._levels[0].cost if self._levels else self._known.best_cost,
             bound=self.bound,
             complete=self.complete,
             theory=self.theory,
@@ -466,7 +481,15 @@ class Search:
             within=self.within,
             levels=tuple(self._levels),
             rivals=self._rivals,
+            evidence=self._said_by_evidence(),
+            odometry_warning=noise_warning(self._first.fit if self._first else None),
         )
+
+    def _said_by_evidence(self) -> dict[str, dict[str, int]]:
+        """For each kind of evidence that takes part, how many pairs of steps it excluded, and how many sets of equalities it refused."""
+        refused = self._known.refused
+        kinds = ((kind.name, kind.pairs(self.trace)) for kind in evidence_of(self.theory))
+        return {name: {"pairs": sum(map(len, pairs.apart.values())), "refused": refused.get(name, 0)} for name, pairs in kinds}
 
     def snapshot(self, stopped: Stop) -> Solution:
         """What is known while the search is still under way in another thread that cannot be stopped. The program ends then: it is of no use any more.

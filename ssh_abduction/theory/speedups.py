@@ -172,7 +172,10 @@ SURVIVE_A_CUT = FRAMES | {
     "path_between_sides",
     "asserted",
     "asserted same",
+    "one_pose",
 }
+# Kinds of evidence that say nothing but which steps are not one dstate, or not at one place, and which labels go not together.
+PAIRS_OF_STEPS = ("asserted", "one_pose")
 
 TABLE = (
     Speedup(
@@ -190,7 +193,7 @@ TABLE = (
         "Causal theory: give the dstates names before clingo is asked.",
         _is_causal,
         CAUSAL,
-        _kept_by("names", and_also=["asserted"]),
+        _kept_by("names", and_also=PAIRS_OF_STEPS),
     ),
     Speedup(
         "visits",
@@ -198,7 +201,7 @@ TABLE = (
         "Places with frames: settle dstates, as visits that are one, before places and paths.",
         _has_frames,
         FRAMES,
-        _kept_by("visits", "sides_framed", "paths_framed", and_also=["asserted"]),
+        _kept_by("visits", "sides_framed", "paths_framed", and_also=PAIRS_OF_STEPS),
     ),
     Speedup(
         "ways",
@@ -206,7 +209,7 @@ TABLE = (
         "Places without stars: where clingo takes its time, settle dstates before places and paths, with names.",
         _has_bare_places,
         PLACES,
-        _kept_by("names", "sides_frameless", "paths_frameless", and_also=["asserted"]),
+        _kept_by("names", "sides_frameless", "paths_frameless", and_also=PAIRS_OF_STEPS),
     ),
     Speedup(
         "clique",
@@ -245,7 +248,7 @@ TABLE = (
         "While a robot drives: a map made without a search is consistent as it is made, and is not checked.",
         _keeps_headings,
         PLACES - {"course_needs_travel"},
-        lambda: SURVIVE_A_CUT - {"asserted", "asserted same"},
+        lambda: SURVIVE_A_CUT - {"asserted same", *PAIRS_OF_STEPS},
     ),
     Speedup(
         "framing",

@@ -1,7 +1,7 @@
 """Which axioms a map has to satisfy, and which of the consistent maps are preferred.
 
 >>> from ssh_abduction import Theory
->>> Theory.topological().prefer
+>>> Theory.topological().priorities
 ('dstates', 'paths', 'places')
 >>> Theory.causal().axioms
 ('functional_view', 'deterministic')
@@ -14,13 +14,13 @@ from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
-from ssh_abduction.errors import TheoryError, TraceError, brief
+from ssh_abduction.errors import TheoryError, TraceError, brief, is_finite, is_whole
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.trace import Step, Trace
 
-Count: TypeAlias = Literal["dstates", "paths", "places", "excuses"]
+Count: TypeAlias = Literal["dstates", "paths", "places", "excuses", "auto"]
 Pair: TypeAlias = tuple[int, int]  # of steps
 
 CHOICES: dict[str, tuple[str, ...]] = {
@@ -28,8 +28,15 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "boundary": ("none", "strict", "defeasible"),
     "path_order": ("partial", "total"),
     "star": ("auto", "none", "pattern", "frame"),
+    "displacement": ("auto", "none", "use"),
 }
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
+# What is preferred unless a user says so. Displacements tell places apart, so that fewest places are seldom too few; without them it is the other way round (docs/truth.md).
+AUTO: tuple[Count, ...] = ("auto",)
+PREFERRED: tuple[Count, ...] = ("dstates", "paths", "places")
+WITH_DISPLACEMENTS: tuple[Count, ...] = ("dstates", "places", "paths")
+# So many returns, at most, may be tested together.
+MOST_JOINT = 2
 # Every trace has fewer steps than this: clingo's numbers have 32 bits, so a pair with a greater step could not even be written as a fact.
 MOST_STEPS = 2**31
 ASSERTIONS = ("same", "different", "elsewhere")
@@ -43,6 +50,9 @@ SPOKEN_FOR = {
     "prefer",
     "without",
     "rules",
+    "reject",
+    "joint",
+    "returns",
     *ASSERTIONS,
 }
 CAUSAL = "Theory.causal() (--theory causal)"  # in error messages
@@ -60,8 +70,13 @@ class Theory:
     all_on_paths     every dstate is along a path, even one that no travel starts or ends at
     star             the openings seen at a place: none, pattern (agree up to rotation), frame (agree when turned by the
                      heading, and paths go straight on); auto is frame where the trace has stars, and none elsewhere
+    displacement     whether displacements are evidence: none, use; auto uses them where the trace has any
+    reject           the probability, at most, that displacements refuse a true map of the trace
+    joint            so many returns are tested together, at most: 1 or 2
+    returns          how many returns of the trace may be true, among which `reject` is shared; 0 counts them in the trace
     prefer           what is minimised, first to last: dstates, paths, places, and with boundary=defeasible excuses, which go first
-                     unless they are named; what is not named is not minimised
+                     unless they are named; what is not named is not minimised. auto is dstates,places,paths where displacements are used,
+                     else dstates,paths,places
     without          names of axioms left out, to see what they do
     rules            a user's own rules: paths of files over the predicates of the encodings, or Rules
     same, different, elsewhere  what a person knows of pairs of steps: that they are one dstate, that they are not, or that they are not even at one place
@@ -76,7 +91,11 @@ class Theory:
     next_place: bool = False
     all_on_paths: bool = False
     star: Literal["auto", "none", "pattern", "frame"] = "auto"
-    prefer: tuple[Count, ...] = ("dstates", "paths", "places")
+    displacement: Literal["auto", "none", "use"] = "auto"
+    reject: float = 0.001
+    joint: int = 2
+    returns: int = 0
+    prefer: tuple[Count, ...] = AUTO
     without: tuple[str, ...] = ()
     rules: tuple[Rules, ...] = ()
     same: tuple[Pair, ...] = ()
@@ -90,7 +109,8 @@ class Theory:
         for field in fields(self):
             if isinstance(field.default, bool) and not isinstance(getattr(self, field.name), bool):
                 raise TheoryError(f"{field.name}: expected true or false, got {brief(getattr(self, field.name))}")
-        self._set_names("prefer", COUNTS)
+        self._check_numbers()
+        self._set_names("prefer", (*COUNTS, *AUTO))
         self._set_names("without", [a.name for a in encodings.axioms()])
         object.__setattr__(self, "rules", Rules.all_of(self.rules))
         for name in ASSERTIONS:
@@ -100,10 +120,24 @@ class Theory:
             for name, value in (("boundary", "none"), ("star", "none")):
                 if getattr(self, name) != value:
                     raise TheoryError(f"{name}: expected {value} with level=causal, got {getattr(self, name)}; take {CAUSAL}")
-            if set(self.prefer) - {"dstates"}:
+            if set(self.prefer) - {"dstates", *AUTO}:
                 raise TheoryError(f"prefer: expected dstates with level=causal, got {', '.join(self.prefer)}; take {CAUSAL}")
+        if "auto" in self.prefer and self.prefer != AUTO:
+            raise TheoryError(f"prefer: expected auto alone, got {', '.join(self.prefer)}; name the counts, or leave it out")
         if "excuses" in self.prefer and self.boundary != "defeasible":
             raise TheoryError(f"prefer: expected no excuses with boundary={self.boundary}; take {_choice('boundary', 'defeasible')}")
+
+    def _check_numbers(self) -> None:
+        if not is_finite(self.reject) or not 0 < self.reject < 1:
+            raise TheoryError(
+                f"reject: expected a probability above 0 and below 1, got {brief(self.reject)}; take 0.001, or another small one"
+            )
+        for name, least, most in (("joint", 1, MOST_JOINT), ("returns", 0, MOST_STEPS)):
+            value = getattr(self, name)
+            if not is_whole(value) or not least <= value <= most:
+                raise TheoryError(f"{name}: expected a whole number from {least} to {most}, got {brief(value)}")
+            object.__setattr__(self, name, int(value))
+        object.__setattr__(self, "reject", float(self.reject))
 
     def _check_rules(self) -> None:
         taken = {axiom.name for axiom in encodings.axioms()}
@@ -152,14 +186,17 @@ class Theory:
 
     @property
     def priorities(self) -> tuple[Count, ...]:
-        """What is minimised, first to last, with the excuses of boundary=defeasible in their place."""
-        if self.boundary == "defeasible" and "excuses" not in self.prefer:
-            return ("excuses", *self.prefer)
-        return self.prefer
+        """What is minimised, first to last, with the excuses of boundary=defeasible in their place. With displacement=auto, that of a trace without displacements."""
+        prefer = self.prefer
+        if prefer == AUTO:
+            prefer = ("dstates",) if self.level == "causal" else WITH_DISPLACEMENTS if self.displacement == "use" else PREFERRED
+        if self.boundary == "defeasible" and "excuses" not in prefer:
+            return ("excuses", *prefer)
+        return prefer
 
     @cached_property
     def axioms(self) -> tuple[str, ...]:
-        """The names of the axioms that hold, those of the user's own rules last. With star=auto, those of a trace without stars."""
+        """The names of the axioms that hold, those of the user's own rules last. With star=auto and displacement=auto, those of a trace that has neither."""
         own = [axiom.name for rules in self.rules for axiom in rules.axioms]
         return (*(a.name for a in encodings.axioms() if a.name not in self.without and a.holds_in(vars(self))), *own)
 
@@ -198,11 +235,11 @@ class Theory:
         if self.level == "causal":
             return None
         boundary = "none" if self.boundary == "none" else "strict"
-        rest = [count for count in self.prefer if count in ("paths", "places")]
+        rest = [count for count in self.priorities if count in ("paths", "places")]
         return self.replace(star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest))
 
     def resolve(self, trace: Trace) -> Theory:
-        """This theory with `star` settled for a trace, after checking that the trace has what the axioms need.
+        """This theory with `star`, `displacement` and `prefer` settled for a trace, after checking that the trace has what the axioms need.
 
         Raises TraceError where a view, the kind of an action, or a star is missing, TheoryError where stars are asked for but
         the trace has none.
@@ -213,10 +250,25 @@ class Theory:
         if star != "none" and not trace.has_stars:
             mend = f"add them to the steps, or take {_choice('star', 'none')}"
             raise TheoryError(f"star: expected a trace with stars for star={star}, got none; {mend}")
-        theory = replace(self, star=star)
+        displacement = self.displacement
+        if displacement == "auto":
+            displacement = "use" if trace.has_displacements else "none"
+        if (
+            displacement == "use" and not trace.has_displacements and not self.returns
+        ):  # once they are counted, this may be a part of a trace
+            mend = f"add them to the steps, or take {_choice('displacement', 'none')}"
+            raise TheoryError(f"displacement: expected a trace with displacements for displacement=use, got none; {mend}")
+        theory = replace(self, star=star, displacement=displacement)
+        theory = replace(theory, prefer=tuple(count for count in theory.priorities if count in self.prefer or count != "excuses"))
         for i, step in enumerate(trace.steps):
             theory.require(step, trace.at(i))
-        return theory
+        return theory._with_returns_of(trace) if displacement == "use" and not self.returns else theory
+
+    def _with_returns_of(self, trace: Trace) -> Theory:
+        """This theory with the returns counted that may be true in a trace."""
+        from ssh_abduction.theory.evidence.displacement import count_returns  # loads numpy
+
+        return replace(self, returns=count_returns(trace, self))
 
     def require(self, step: Step, where: str) -> None:
         """Raises TraceError, which says where, if a step lacks what the axioms need. Star has to be settled."""

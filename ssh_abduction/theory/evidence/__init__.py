@@ -13,19 +13,20 @@ variables (`Pairs`), so that evidence makes solving faster. What it finds out on
 from __future__ import annotations
 
 from ssh_abduction.theory.evidence.asserted import Asserted
+from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
-KINDS: tuple[type[Evidence], ...] = (Asserted,)
+KINDS: tuple[type[Evidence], ...] = (Asserted, Displacement)
 
-__all__ = ["KINDS", "NO_PAIRS", "Asserted", "Equality", "Evidence", "Pairs", "evidence_of", "pairs_of"]
+__all__ = ["KINDS", "NO_PAIRS", "Asserted", "Displacement", "Equality", "Evidence", "Pairs", "evidence_of", "pairs_of"]
 
 
 def evidence_of(theory: Theory) -> tuple[Evidence, ...]:
     """The kinds of evidence that take part in a theory, made for it."""
-    return tuple(kind.of(theory) for kind in KINDS if kind.name in theory.axioms)
+    return tuple(kind.of(theory) for kind in KINDS if kind.axiom in theory.axioms)
 
 
 def pairs_of(trace: Trace, theory: Theory) -> Pairs:

@@ -19,6 +19,7 @@ class Asserted:
     """The fields `same`, `different` and `elsewhere` of a theory. Pairs with a step that the trace does not have (yet) say nothing."""
 
     name: ClassVar[str] = "asserted"
+    axiom: ClassVar[str] = "asserted"
     said: Pairs
 
     @classmethod

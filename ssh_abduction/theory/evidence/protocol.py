@@ -23,9 +23,10 @@ class Equality:
 
 
 class Evidence(Protocol):
-    """A kind of evidence. encodings/NAME.lp holds its axiom, which has the same name, and says with `if` for which theories it holds."""
+    """A kind of evidence. encodings/NAME.lp holds its axiom, and says with `if` for which theories it holds."""
 
     name: ClassVar[str]
+    axiom: ClassVar[str]
 
     @classmethod
     def of(cls, theory: Theory) -> Evidence:

@@ -1,0 +1,247 @@
+"""How well a map closes: the poses of its dstates that agree best with the displacements of the trace.
+
+>>> from ssh_abduction import Theory, Trace, solve
+>>> from ssh_abduction.fit import fit
+>>> square = [(10, 0, 0), (0, 0, 1.5708)] * 4
+>>> trace = Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=square)
+>>> ssh_map = solve(trace, Theory.causal()).maps[0]
+>>> found = fit(trace, ssh_map)
+>>> len(found.poses) == len(ssh_map.dstates)
+True
+
+Unknown are the position of each place (of each dstate, where the map has no places), the heading of each dstate, and what is wrong with all displacements: their
+scale, and a steady drift of heading, which have a prior. Each displacement of the trace, divided by its standard deviations, says what they should be. The best poses are
+those with the least sum of squares (Lu & Milios 1997, "Globally consistent range scan alignment"). That sum is chi-square distributed if the map is true and the
+odometry is as good as it says. It ranks maps that are equally minimal, and warns; it refuses none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import lsqr, splu
+from scipy.special import gammaincc
+
+from ssh_abduction.maps import Fit, Pose, SSHMap
+from ssh_abduction.odometry import Odometry
+from ssh_abduction.trace import Trace
+
+Array: TypeAlias = NDArray[np.float64]
+
+# With a standard deviation below this, in metres or radians, a displacement counts as exact.
+EXACT = 2e-3
+
+
+def fit(trace: Trace, ssh_map: SSHMap, start: Sequence[Pose] | None = None) -> Fit:
+    """The poses of the dstates of a map that agree best with the displacements, and how well they do.
+
+    trace    with displacements on some of its steps
+    ssh_map  a map of all of its steps
+    start    poses to begin with, such as those of a map that is nearly the same; without them headings are found first, then positions
+    """
+    return _Problem(trace, ssh_map).solved(start)
+
+
+class _Problem:
+    """Least squares over the places and headings of one map.
+
+    The unknowns are x and y of each position, then the heading of each dstate, then the scale and the drift, as multiples of their standard deviations.
+    """
+
+    def __init__(self, trace: Trace, ssh_map: SSHMap) -> None:
+        odometry = trace.odometry or Odometry()
+        steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
+        labels = np.asarray(ssh_map.labels, dtype=int)
+        self._of_step = np.asarray(steps, dtype=int)
+        self._from, self._to = labels[self._of_step - 1], labels[self._of_step]
+        self._moved = np.array([trace.steps[t].displacement for t in steps], dtype=float).reshape(-1, 3)
+        noise = np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
+        self._whitening = np.linalg.inv(np.linalg.cholesky(noise)) if steps else noise
+        self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
+        self._sigma = np.array([odometry.scale, odometry.bend])
+        places = [s.place if s.place is not None else -1 - s.id for s in ssh_map.dstates]
+        number = {place: i for i, place in enumerate(dict.fromkeys(places))}
+        self._place = np.array([number[place] for place in places], dtype=int)
+        self._positions, self._headings = len(number), len(places)
+        self._size = 2 * self._positions + self._headings + 2
+
+    def solved(self, start: Sequence[Pose] | None) -> Fit:
+        unknown = self._begun(start)
+        if len(self._moved):
+            found = least_squares(self._residuals, unknown, self._jacobian, method="trf", tr_solver="lsmr", x_scale="jac", max_nfev=50)
+            unknown = found.x
+        squares = float((self._residuals(unknown) ** 2).sum())
+        freedom = self._freedom(unknown)
+        p = float(gammaincc(freedom / 2, squares / 2)) if freedom > 0 else 1.0
+        scale, bend = (float(x) for x in unknown[-2:] * self._sigma)
+        return Fit(squares, freedom, p, scale, bend, self._poses(unknown))
+
+    def _begun(self, start: Sequence[Pose] | None) -> Array:
+        """Unknowns to begin with."""
+        unknown = np.zeros(self._size)
+        at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
+        if start is not None and len(start) == self._headings:
+            at[self._place] = [(pose.x, pose.y) for pose in start]
+            heading[:] = [pose.heading for pose in start]
+            return unknown
+        # Headings first, which are linear but for whole turns, and then positions, which are linear where headings are known (Carlone et al. 2014).
+        reckoned = self._headings_by_first_visit()
+        turned = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
+        turned -= math.tau * np.round(turned / math.tau)
+        heading[:] = reckoned + _least(
+            self._differences(self._from, self._to, self._headings), turned / self._sigmas(2), 1 / self._sigmas(2)
+        )
+        cos, sin = np.cos(heading[self._from]), np.sin(heading[self._from])
+        moved = np.stack([cos * self._moved[:, 0] - sin * self._moved[:, 1], sin * self._moved[:, 0] + cos * self._moved[:, 1]], axis=1)
+        differences = self._differences(self._place[self._from], self._place[self._to], self._positions)
+        weights = 1 / self._sigmas(0)
+        for axis in range(2):
+            at[:, axis] = _least(differences, moved[:, axis] * weights, weights)
+        return unknown
+
+    def _headings_by_first_visit(self) -> Array:
+        """For each dstate, the heading by dead reckoning when it was first visited."""
+        heading = np.zeros(self._headings)
+        known: dict[int, float] = {}
+        here, last = 0.0, None
+        for s, x, turned in zip(self._from.tolist(), self._to.tolist(), self._moved[:, 2].tolist(), strict=True):
+            here = known.setdefault(s, here if last == s else 0.0)
+            here, last = here + turned, x
+            here = known.setdefault(x, here)
+        for s, angle in known.items():
+            heading[s] = angle
+        return heading
+
+    def _sigmas(self, axis: int) -> Array:
+        """The standard deviation of each displacement along an axis, about."""
+        sigmas: Array = 1 / np.sqrt((self._whitening[:, :, axis] ** 2).sum(1))
+        return sigmas
+
+    def _differences(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
+        """The matrix that makes, of values, their differences: second minus first."""
+        rows = np.arange(len(first))
+        ones = np.ones(len(first))
+        entries = np.concatenate([ones, -ones]), (np.concatenate([rows, rows]), np.concatenate([second, first]))
+        return coo_array(entries, shape=(len(first), size)).tocsr()
+
+    def _predicted(self, unknown: Array) -> tuple[Array, Array, Array, Array]:
+        """What each displacement should be, how far it goes in the frame of the map, and the cosine and sine of the heading in its middle."""
+        at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
+        scale, bend = unknown[-2:] * self._sigma
+        gone = at[self._place[self._to]] - at[self._place[self._from]]
+        facing = heading[self._from] - bend * self._way / 2
+        cos, sin = np.cos(facing), np.sin(facing)
+        ahead, left = cos * gone[:, 0] + sin * gone[:, 1], cos * gone[:, 1] - sin * gone[:, 0]
+        turned = heading[self._to] - heading[self._from] + bend * self._way
+        return np.stack([(1 + scale) * ahead, (1 + scale) * left, turned], axis=1), gone, cos, sin
+
+    def _residuals(self, unknown: Array) -> Array:
+        predicted = self._predicted(unknown)[0]
+        off = predicted - self._moved
+        off[:, 2] -= math.tau * np.round(off[:, 2] / math.tau)
+        return np.concatenate([np.einsum("nij,nj->ni", self._whitening, off).ravel(), unknown[-2:]])
+
+    def _jacobian(self, unknown: Array) -> csr_array:
+        predicted, _, cos, sin = self._predicted(unknown)
+        scale = 1 + unknown[-2] * self._sigma[0]
+        m, heading = len(self._moved), 2 * self._positions
+        zero, one = np.zeros(m), np.ones(m)
+        ahead, left = predicted[:, 0], predicted[:, 1]
+        by_x, by_y = np.stack([scale * cos, -scale * sin, zero], 1), np.stack([scale * sin, scale * cos, zero], 1)
+        by_facing = np.stack([left, -ahead, zero], 1)
+        columns = [
+            (2 * self._place[self._to], by_x),
+            (2 * self._place[self._to] + 1, by_y),
+            (2 * self._place[self._from], -by_x),
+            (2 * self._place[self._from] + 1, -by_y),
+            (heading + self._from, by_facing - np.stack([zero, zero, one], 1)),
+            (heading + self._to, np.stack([zero, zero, one], 1)),
+            (np.full(m, self._size - 2), np.stack([ahead, left, zero], 1) * (self._sigma[0] / scale)),
+            (np.full(m, self._size - 1), (-by_facing / 2 + np.stack([zero, zero, one], 1)) * self._way[:, None] * self._sigma[1]),
+        ]
+        rows = np.arange(3 * m)
+        values = [np.einsum("nij,nj->ni", self._whitening, derivative).ravel() for _, derivative in columns]
+        priors = np.arange(2)
+        entries = (
+            np.concatenate([*values, np.ones(2)]),
+            (
+                np.concatenate([np.tile(rows, len(columns)), 3 * m + priors]),
+                np.concatenate([*(np.repeat(column, 3) for column, _ in columns), self._size - 2 + priors]),
+            ),
+        )
+        return coo_array(entries, shape=(3 * m + 2, self._size)).tocsr()
+
+    def _parts(self) -> tuple[int, NDArray[np.int_]]:
+        """How many parts of the map displacements do not connect, and the part of each position."""
+        ends = self._place[self._from], self._place[self._to]
+        graph = coo_array((np.ones(len(ends[0])), ends), shape=(self._positions, self._positions))
+        count, part = connected_components(graph, directed=False)
+        return int(count), part
+
+    def _freedom(self, unknown: Array) -> int:
+        """The degrees of freedom: what displacements say, without what the poses take up. Each part of the map may be moved and turned as a whole.
+
+        What is known to the millimetre has no noise that would count: it settles as many unknowns as it is about, and says no more.
+        """
+        said = np.unique(np.concatenate([self._from, self._to]))
+        used = np.unique(self._place[said])
+        parts = len(np.unique(self._parts()[1][used]))
+        exact = (1 / np.sqrt((self._whitening**2).sum(1)) < EXACT).ravel()
+        settled = int(np.linalg.matrix_rank(self._jacobian(unknown)[: len(exact)][exact].toarray())) if exact.any() else 0
+        return int(len(exact) - exact.sum() - (2 * len(used) + len(said) - 3 * parts - settled))
+
+    def _poses(self, unknown: Array) -> tuple[Pose, ...]:
+        """The poses, each part of the map seen from the first dstate there; and how uncertain the positions are as seen from it."""
+        at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
+        _, part = self._parts()
+        first = {int(part[self._place[s]]): s for s in range(self._headings - 1, -1, -1)}
+        poses: list[Pose] = []
+        spreads = self._spreads(unknown, list(first.values()))
+        for s in range(self._headings):
+            origin = first[int(part[self._place[s]])]
+            dx, dy = at[self._place[s]] - at[self._place[origin]]
+            cos, sin = math.cos(heading[origin]), math.sin(heading[origin])
+            turned = math.remainder(float(heading[s] - heading[origin]), math.tau)
+            back = np.array([[cos, sin], [-sin, cos]])
+            (xx, xy), (_, yy) = back @ spreads[s] @ back.T
+            poses.append(Pose(float(cos * dx + sin * dy), float(cos * dy - sin * dx), turned, (float(xx), float(xy), float(yy))))
+        return tuple(poses)
+
+    def _spreads(self, unknown: Array, origins: Sequence[int]) -> Array:
+        """The covariance of the position of each dstate, m x 2 x 2, in square metres, where the poses of the origins are known."""
+        jacobian = self._jacobian(unknown)
+        fixed = [k for s in origins for k in (2 * self._place[s], 2 * self._place[s] + 1, 2 * self._positions + s)]
+        free = np.setdiff1d(np.arange(self._size), fixed)
+        information: Any = (jacobian.T @ jacobian)[free][:, free]
+        information = (information + 1e-12 * _identity(len(free))).tocsc()
+        solver = splu(information)
+        number = {int(k): i for i, k in enumerate(free)}
+        covariance = np.zeros((self._positions, 2, 2))
+        for place in range(self._positions):
+            if 2 * place not in number:
+                continue
+            columns = np.zeros((len(free), 2))
+            rows = [number[2 * place], number[2 * place + 1]]
+            columns[rows, [0, 1]] = 1.0
+            covariance[place] = solver.solve(columns)[rows]
+        spreads: Array = covariance[self._place]
+        return spreads
+
+
+def _identity(size: int) -> csr_array:
+    numbers = np.arange(size)
+    return coo_array((np.ones(size), (numbers, numbers)), shape=(size, size)).tocsr()
+
+
+def _least(differences: csr_array, values: Array, weights: Array) -> Array:
+    """Values whose differences come nearest to these, which are weighted already."""
+    weighted = csr_array(differences.multiply(weights[:, None]))
+    solved: Array = lsqr(weighted, values, atol=1e-10, btol=1e-10, iter_lim=4 * differences.shape[1] + 100)[0]
+    return solved

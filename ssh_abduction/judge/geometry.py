@@ -1,0 +1,255 @@
+"""Whether the returns of a map agree with the displacements of its trace: the judge's own account of the axiom `one_pose`.
+
+It follows the error of the robot's pose as a Kalman filter predicts it. Let E(t) be the error of the pose by dead reckoning at step t, in the frame of the
+first step, and V(t) its covariance. What was wrong at step i is wrong at a later step j, too, turned about where the robot was:
+
+    F(j, i) = [[1, S (p(j) - p(i))], [0, 1]]        with S a quarter turn, and p where the robot was.
+
+So the loop from i to j closes with the error E(j) - F(j, i) E(i). Its covariance is V(j) - F(j, i) V(i) F(j, i)', as what is new at each step is independent of what
+was before; and two loops have in common what was new between the later of their beginnings b and the earlier of their ends e. A scale that is wrong and a
+heading that drifts are carried along as two more errors, which never change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammainccinv
+
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.odometry import Odometry
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Trace
+
+Array: TypeAlias = NDArray[np.float64]
+Return: TypeAlias = tuple[int, int, int]  # two steps, and the degrees of freedom: 2 at one place, 3 at one dstate
+
+# What docs/theory.md says of one_pose: the errors of heading that are reckoned with, the uncertainty at which a heading is lost, the steps in which a drift is tried and how far.
+SIGMAS, LOST, BENDS_A_SIGMA, MOST_BENDS, ROUNDED = 6.0, 1.0, 2, 6, 1e-3
+# So many sets are worked on in one go.
+AT_A_TIME = 100_000
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Returns of a map that are refused, alone or two together: their steps, and how likely so bad a closing is at most, as chi-square and threshold."""
+
+    returns: tuple[Return, ...]
+    square: float
+    most: float
+
+
+def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Refused]:
+    """The first return of a map that is refused, and the first set of two, if there are any.
+
+    trace   the whole trace
+    theory  resolved, so that it says how many returns may be true
+    """
+    if not trace.has_displacements:
+        return
+    drifts = list(_drifts(trace))
+    returns = list(_returns(trace, ssh_map, theory, drifts[0][0]))
+    yield from _refused_alone(returns, drifts, theory)
+    if theory.joint > 1:
+        yield from _refused_together(returns, drifts, theory)
+
+
+class _Filter:
+    """Poses by dead reckoning, and the covariance of their errors, of pose (3), scale and drift."""
+
+    def __init__(self, trace: Trace, odometry: Odometry, bend: float, drift: float) -> None:
+        size = len(trace)
+        self.pose = np.zeros((size, 3))
+        self.white = np.zeros((size, 3, 3))  # covariance of the error of the pose by noise alone
+        self.repeated = np.zeros((size, 3, 2))  # how the pose moves with the scale, and with the drift
+        self.broken = np.zeros(size, dtype=int)  # displacements that are missing so far
+        self.sigma = np.array([odometry.scale, drift])
+        for t in range(1, size):
+            x, y, heading = self.pose[t - 1]
+            displacement, covariance = trace.steps[t].displacement, trace.covariance(t)
+            self.broken[t] = self.broken[t - 1] + (displacement is None)
+            if displacement is None or covariance is None:
+                self.pose[t], self.white[t], self.repeated[t] = self.pose[t - 1], self.white[t - 1], self.repeated[t - 1]
+                continue
+            dx, dy, turned = displacement
+            way = math.hypot(dx, dy)
+            cos, sin = math.cos(heading - bend * way / 2), math.sin(heading - bend * way / 2)
+            moved = np.array([cos * dx - sin * dy, sin * dx + cos * dy])
+            self.pose[t] = x + moved[0], y + moved[1], heading + turned - bend * way
+            onward = _onward(moved)
+            cos, sin = math.cos(heading), math.sin(heading)
+            turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+            self.white[t] = onward @ self.white[t - 1] @ onward.T + turn @ np.array(covariance) @ turn.T
+            new = np.array([[moved[0], -moved[1] * way / 2], [moved[1], moved[0] * way / 2], [0.0, way]])
+            self.repeated[t] = onward @ self.repeated[t - 1] + new
+
+    def onward(self, first: Any, last: Any) -> Array:
+        """F(last, first), m x 3 x 3."""
+        return _onward(self.pose[last, :2] - self.pose[first, :2])
+
+    def since(self, first: Any, last: Any) -> Array:
+        """The covariance, by noise alone, of what went wrong between two steps."""
+        onward = self.onward(first, last)
+        covariance: Array = self.white[last] - onward @ self.white[first] @ onward.swapaxes(-1, -2)
+        return covariance
+
+    def repeated_since(self, first: Any, last: Any) -> Array:
+        """How a loop moves with the scale and the drift, times the standard deviation of these: m x 3 x 2."""
+        moved: Array = (self.repeated[last] - self.onward(first, last) @ self.repeated[first]) * self.sigma
+        return moved
+
+    def covariance(self, first: Any, last: Any) -> Array:
+        """The covariance of closings, with what is added as errors of heading are no longer small."""
+        white, repeated = self.since(first, last), self.repeated_since(first, last)
+        heading = self.lost(first, last)
+        moved = self._moved_by_heading(first, last) + (repeated[..., :2, 1] ** 2).sum(-1)
+        bent = (SIGMAS / 2) ** 2 * heading * moved + ROUNDED**2
+        added = bent[..., None, None] * np.diag([1.0, 1.0, 0.0]) + ROUNDED**2 * np.diag([0.0, 0.0, 1.0])
+        total: Array = white + repeated @ repeated.swapaxes(-1, -2) + added
+        return total
+
+    def lost(self, first: Any, last: Any) -> Array:
+        """The variance of the heading at the end of loops."""
+        variance: Array = self.since(first, last)[..., 2, 2] + self.repeated_since(first, last)[..., 2, 1] ** 2
+        return variance
+
+    def _moved_by_heading(self, first: Any, last: Any) -> Array:
+        """The variance of the end of loops that comes of the noise of headings: the sum, over the steps of a loop, of that noise times the squared distance to the end."""
+        angle = np.diff(self.white[:, 2, 2], prepend=0.0)
+        x, y = self.pose[:, 0], self.pose[:, 1]
+        sums = [np.cumsum(angle * factor) for factor in (np.ones_like(x), x, y, x * x + y * y)]
+        one, by_x, by_y, square = (s[last] - s[first] for s in sums)
+        moved: Array = np.maximum(square - 2 * (by_x * x[last] + by_y * y[last]) + one * (x[last] ** 2 + y[last] ** 2), 0.0)
+        return moved
+
+    def is_known(self, first: Any, last: Any) -> NDArray[np.bool_]:
+        """Whether loops have all their displacements, and the heading is not lost along any loop that ends where they do and begins later."""
+        known: NDArray[np.bool_] = (self.broken[first] == self.broken[last]) & (self.lost(first, last) <= LOST**2)
+        return known
+
+    def closing(self, first: Any, last: Any) -> Array:
+        """How far off loops close, m x 3."""
+        off = self.pose[last] - self.pose[first]
+        off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
+        return off
+
+
+def _onward(moved: Array) -> Array:
+    """What an error of the pose becomes once the robot has moved on by so much, m x 2."""
+    onward = np.zeros((*moved.shape[:-1], 3, 3))
+    onward[..., range(3), range(3)] = 1.0
+    onward[..., 0, 2], onward[..., 1, 2] = -moved[..., 1], moved[..., 0]
+    return onward
+
+
+def _drifts(trace: Trace) -> Iterator[tuple[_Filter, float]]:
+    """The poses for each drift of the heading, and the chi-square of that drift, no drift first."""
+    odometry = trace.odometry or Odometry()
+    numbers = range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1) if odometry.bend else [0]
+    step = odometry.bend / BENDS_A_SIGMA
+    for n in sorted(numbers, key=lambda n: (abs(n), n)):
+        yield _Filter(trace, odometry, n * step, step / 2), max(abs(n) - 0.5, 0.0) ** 2 / BENDS_A_SIGMA**2
+
+
+def _returns(trace: Trace, ssh_map: SSHMap, theory: Theory, known: _Filter) -> Iterator[Return]:
+    """The returns of a map about which displacements say something."""
+    place = {s.id: s.place for s in ssh_map.dstates}
+    size = min(len(trace), len(ssh_map.labels))
+    labels = ssh_map.labels[:size]
+    arrived = [t for t in range(size) if t == 0 or trace.actions[t - 1].kind != "turn"]
+    groups: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for t in range(size):
+        groups[3, labels[t]].append(t)
+    for t in arrived if theory.level == "topological" else ():
+        there = place.get(labels[t])
+        if there is not None:
+            groups[2, there].append(t)
+    for (freedom, _), steps in groups.items():
+        for number, last in enumerate(steps):
+            first = np.array(steps[:number], dtype=int)
+            if number:
+                yield from ((int(i), last, freedom) for i in first[known.is_known(first, np.full(number, last))])
+
+
+def _most(theory: Theory, freedom: int, together: bool) -> float:
+    """The chi-square above which returns are refused."""
+    share = theory.reject / 2 if theory.joint > 1 else theory.reject
+    tests = theory.returns * (theory.returns - 1) / 2 if together else theory.returns
+    return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
+
+
+def _refused_alone(returns: Sequence[Return], drifts: Sequence[tuple[_Filter, float]], theory: Theory) -> Iterator[Refused]:
+    for freedom in (2, 3):
+        rows = np.array([r for r in returns if r[2] == freedom], dtype=int).reshape(-1, 3)
+        most, least = _most(theory, freedom, together=False), np.full(len(rows), np.inf)
+        for filtered, unlikely in drifts:
+            first, last = rows[:, 0], rows[:, 1]
+            square = _square(filtered.closing(first, last)[:, :freedom], filtered.covariance(first, last)[:, :freedom, :freedom])
+            least = np.minimum(least, np.where(filtered.is_known(first, last), square + unlikely, 0.0))
+        if len(rows) and least.max() > most:
+            worst = int(least.argmax())
+            yield Refused((returns_row(rows[worst]),), float(least[worst]), most)
+
+
+def _refused_together(returns: Sequence[Return], drifts: Sequence[tuple[_Filter, float]], theory: Theory) -> Iterator[Refused]:
+    rows = np.array(sorted(returns), dtype=int).reshape(-1, 3)
+    for a in range(len(rows)):
+        for start in range(0, a, AT_A_TIME):
+            others = np.arange(start, min(a, start + AT_A_TIME))
+            overlap = np.maximum(rows[others, 0], rows[a, 0]) < np.minimum(rows[others, 1], rows[a, 1])
+            others = others[overlap]
+            least = np.full(len(others), np.inf)
+            most = np.array([_most(theory, int(f), together=True) for f in rows[others, 2] + rows[a, 2]])
+            for filtered, unlikely in drifts:
+                left = np.flatnonzero(least > most)
+                if not len(left):
+                    break
+                least[left] = np.minimum(least[left], _square_together(filtered, rows, a, others[left]) + unlikely)
+            refused = np.flatnonzero(least > most)
+            if len(refused):
+                worst = int(refused[np.argmax(least[refused] - most[refused])])
+                pair = returns_row(rows[others[worst]]), returns_row(rows[a])
+                yield Refused(pair, float(least[worst]), float(most[worst]))
+                return
+
+
+def _square_together(filtered: _Filter, rows: NDArray[np.int_], a: int, others: NDArray[np.int_]) -> Array:
+    """The chi-square of row `a` together with each other row; 0 where nothing is known of one of the two."""
+    m, here = len(others), np.full(len(others), a)
+    begin, end = np.maximum(rows[others, 0], rows[a, 0]), np.minimum(rows[others, 1], rows[a, 1])
+    common = filtered.since(begin, end)
+    mixed = filtered.onward(end, rows[here, 1]) @ common @ filtered.onward(end, rows[others, 1]).swapaxes(1, 2)
+    mixed += filtered.repeated_since(rows[here, 0], rows[here, 1]) @ filtered.repeated_since(rows[others, 0], rows[others, 1]).swapaxes(
+        1, 2
+    )
+    joint, off = np.zeros((m, 6, 6)), np.zeros((m, 6))
+    for k, which in enumerate((here, others)):
+        part = slice(3 * k, 3 * k + 3)
+        off[:, part] = filtered.closing(rows[which, 0], rows[which, 1])
+        joint[:, part, part] = filtered.covariance(rows[which, 0], rows[which, 1])
+    joint[:, :3, 3:], joint[:, 3:, :3] = mixed, mixed.swapaxes(1, 2)
+    for k, which in enumerate((here, others)):  # the heading of a return to a place is not asked for
+        free = rows[which, 2] == 2
+        off[free, 3 * k + 2] = 0.0
+        joint[free, 3 * k + 2, :] = joint[free, :, 3 * k + 2] = 0.0
+        joint[free, 3 * k + 2, 3 * k + 2] = 1.0
+    known = filtered.is_known(rows[here, 0], rows[here, 1]) & filtered.is_known(rows[others, 0], rows[others, 1])
+    square: Array = np.where(known, _square(off, joint), 0.0)
+    return square
+
+
+def _square(off: Array, covariance: Array) -> Array:
+    square: Array = np.einsum("mi,mi->m", off, np.linalg.solve(covariance, off[..., None])[..., 0])
+    return square
+
+
+def returns_row(row: NDArray[np.int_]) -> Return:
+    """A return from its row."""
+    first, last, freedom = map(int, row)
+    return first, last, freedom

@@ -1,0 +1,78 @@
+"""Ranks equally minimal maps by how well they close, where the trace has displacements."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+from ssh_abduction.maps import Fit, SSHMap
+from ssh_abduction.trace import Trace
+
+# So many maps are ranked, at most; of a longer list those that come later stay in the order in which they are found, so that memory stays constant.
+RANKED = 1000
+# The noise of the odometry is said to be wrong where a chi-square like that of the best map is as unlikely as this, in either direction,
+DOUBTED = 1e-3
+# and the standard deviations are wrong by this factor at least: less changes no answer.
+OFF = 1.5
+
+_Key: TypeAlias = tuple[tuple[int, ...], tuple[int | None, ...]]
+
+
+class Ranking:
+    """Says of maps of one trace how well they close. Maps that differ in paths alone close alike, so that is worked out once."""
+
+    def __init__(self, trace: Trace) -> None:
+        self._trace = trace
+        self._known: dict[_Key, Fit] = {}
+        self._last: Fit | None = None
+
+    def fitted(self, ssh_map: SSHMap) -> SSHMap:
+        """The same map, with how well it closes."""
+        from ssh_abduction.fit import fit  # loads scipy
+
+        key = ssh_map.labels, tuple(s.place for s in ssh_map.dstates)
+        if key not in self._known:
+            self._last = self._known[key] = fit(self._trace, ssh_map)
+        return replace(ssh_map, fit=self._known[key])
+
+    def ranked(self, maps: Iterator[SSHMap], over: Callable[[], bool]) -> Iterator[SSHMap]:
+        """The same maps, the one that closes best first.
+
+        over  whether the limits are over: then maps come as they are found, but for the first one without how well they close
+        """
+        held: list[SSHMap] = []
+        for ssh_map in maps:
+            held.append(ssh_map if held and over() else self.fitted(ssh_map))
+            if len(held) == RANKED:
+                break
+        yield from sorted(held, key=lambda m: m.fit.chi2 if m.fit else math.inf)
+        yield from (ssh_map if over() else self.fitted(ssh_map) for ssh_map in maps)
+
+
+def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
+    """How likely rival maps are, as displacements alone say, among these: exp(-chi2/2), normalised. Empty unless all of them have a fit."""
+    squares = [ssh_map.fit.chi2 for ssh_map in maps if ssh_map.fit]
+    if not squares or len(squares) < len(maps):
+        return ()
+    likely = [math.exp((min(squares) - square) / 2) for square in squares]
+    return tuple(weight / sum(likely) for weight in likely)
+
+
+def noise_warning(fit: Fit | None) -> str | None:
+    """What is wrong with the noise that the odometry claims, by how well the best map closes; None where nothing is."""
+    if fit is None or fit.dof < 1 or min(fit.p, 1 - fit.p) > DOUBTED / 2:
+        return None
+    factor = math.sqrt(fit.chi2 / fit.dof)
+    if 1 / OFF < factor < OFF:
+        return None
+    how, told = ("smaller", "tight") if factor > 1 else ("larger", "loose")
+    return (
+        f"the noise model of the odometry is too {told}: the best map closes with a chi-square of {fit.chi2:.0f} where {fit.dof} is expected, "
+        f"so its standard deviations are {_times(factor)} {how} than the errors; multiply them by {factor:.2g}"
+    )
+
+
+def _times(factor: float) -> str:
+    return f"{max(factor, 1 / factor):.1f} times"

@@ -1,0 +1,248 @@
+"""How far off the loops of a trace close: displacements and their covariances, composed along the trace.
+
+>>> from ssh_abduction import Trace
+>>> from ssh_abduction.theory.loops import Loops
+>>> square = [(10, 0, 0), (0, 0, 1.5708)] * 4
+>>> loops = Loops.of(Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=square))
+>>> closing, covariance = loops.closings([0], [8])
+>>> bool(abs(closing[0]).max() < 0.001), covariance.shape
+(True, (1, 3, 3))
+
+A loop leads from step i to a later step j. It closes if the robot is then where it was before. By the displacements d of the steps between, it closes off by
+P(j) - P(i), where P is the pose by dead reckoning: all displacements composed from the first step on. An error e of a displacement that leads to step k turns all
+that comes after it. So to first order it moves the end of the loop by
+
+    R(k) e_xy + e_theta S (p(j) - p(k))        where R(k) is the heading before the displacement, and S a quarter turn,
+
+and the covariance of the closing is the sum of these over the loop (Smith, Self & Cheeseman 1990, "Estimating uncertain spatial relationships in
+robotics"). It is a polynomial in p(j), so that sums from the first step on give it for any loop at once. Two errors repeat, and are unknown numbers of the
+whole trace rather than noise: a wrong scale, and a steady drift of heading.
+
+*Where headings are lost.* First order takes an arc for its tangent. An error of heading that is rare, at SIGMAS standard deviations, bends the way off the tangent by
+half of itself, as a share of what first order says it moves the end by. So much is added to the covariance, in all directions: where the heading is known to a few degrees that
+is next to nothing, and where it is lost nothing can be said any more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ssh_abduction.odometry import ROUNDED, Odometry
+from ssh_abduction.trace import Trace
+
+Array: TypeAlias = NDArray[np.float64]
+Steps: TypeAlias = NDArray[np.int_]
+
+# Tests that together may refuse a true map once in a thousand traces refuse what is about so many standard deviations off.
+SIGMAS = 6.0
+# Nothing is said of loops after which the heading is uncertain by more than this, in radians: what is added for that outweighs any error.
+LOST = 1.0
+# So many values of a steady drift of heading are tried for each standard deviation of it: a loop is refused if it closes badly with each of them.
+BENDS_A_SIGMA = 2
+# Drifts of more standard deviations than this are as unlikely as what is refused.
+MOST_BENDS = 6
+
+
+@dataclass(frozen=True)
+class Loops:
+    """Dead reckoning of a trace, and the sums from which closings are made.
+
+    poses     by dead reckoning, n x 3, in metres and radians; where a displacement is missing the next pose is that of the step before
+    part      for each step, the number of displacements that are missing up to it: nothing is known of loops across one
+    moments   sums over the displacements up to each step, n x 17
+    ways      metres driven up to each step, and the sum of metres times where they were driven, turned by S: n x 3
+    odometry  what is wrong with all displacements
+    bend      drift of heading that was taken out of the displacements, in radians a metre
+    drift     standard deviation of the drift that is left, in radians a metre
+    """
+
+    poses: Array
+    part: Steps
+    moments: Array
+    ways: Array
+    odometry: Odometry
+    bend: float
+    drift: float
+
+    @staticmethod
+    def of(trace: Trace, bend: float = 0.0, drift: float | None = None) -> Loops:
+        """The loops of a trace, once a drift of heading was taken out of its displacements.
+
+        bend   that drift, in radians a metre
+        drift  standard deviation of the drift that is left; what the odometry says if not given
+        """
+        size = len(trace)
+        odometry = trace.odometry or Odometry()
+        moved, noise = np.zeros((size, 3)), np.zeros((size, 3, 3))
+        known = np.zeros(size, dtype=bool)
+        for t in range(1, size):
+            displacement = trace.steps[t].displacement
+            if displacement is not None:
+                moved[t], noise[t], known[t] = displacement, trace.covariance(t), True
+        way = np.hypot(moved[:, 0], moved[:, 1])
+        moved[:, :2] = _turned(moved[:, :2], -bend * way / 2)
+        moved[:, 2] -= bend * way
+        heading = np.cumsum(moved[:, 2])
+        before = heading - moved[:, 2]  # the heading in which each displacement begins
+        position = np.cumsum(_turned(moved[:, :2], before), axis=0)
+        rotation = np.zeros((size, 3, 3))
+        rotation[:, 0, 0] = rotation[:, 1, 1] = np.cos(before)
+        rotation[:, 1, 0], rotation[:, 0, 1], rotation[:, 2, 2] = np.sin(before), -np.sin(before), 1.0
+        noise = rotation @ noise @ rotation.transpose(0, 2, 1)
+        across = _quarter_turned(position)
+        angle, mixed = noise[:, 2, 2], noise[:, :2, 2]
+        columns = [
+            noise[:, :2, :2].reshape(-1, 4),
+            mixed,
+            (mixed[:, :, None] * across[:, None, :]).reshape(-1, 4),
+            angle[:, None],
+            angle[:, None] * across,
+            (angle[:, None, None] * across[:, :, None] * across[:, None, :]).reshape(-1, 4),
+        ]
+        middle = position - _turned(moved[:, :2], before) / 2
+        ways = np.hstack([way[:, None], way[:, None] * _quarter_turned(middle)])
+        part = np.cumsum(~known) - (not known[0])
+        drift = odometry.bend if drift is None else drift
+        poses = np.hstack([position, heading[:, None]])
+        return Loops(poses, part, np.cumsum(np.hstack(columns), axis=0), np.cumsum(ways, axis=0), odometry, bend, drift)
+
+    def closings(self, first: ArrayLike, last: ArrayLike) -> tuple[Array, Array]:
+        """How far off loops close, m x 3, and the covariance of that, m x 3 x 3; in metres and radians, and in the frame of the first step of the trace.
+
+        first, last  the steps at which each loop begins and ends, m each
+        """
+        i, j = np.asarray(first, dtype=int), np.asarray(last, dtype=int)
+        closing = self._closing(i, j)
+        covariance = self._shared(i, j, j, j)
+        lost = self._heading_variance(i, j)
+        moved_by_heading = self._moved_by_heading(i, j)
+        bent = (SIGMAS / 2) ** 2 * lost * moved_by_heading + ROUNDED**2
+        covariance[:, 0, 0] += bent
+        covariance[:, 1, 1] += bent
+        covariance[:, 2, 2] += ROUNDED**2
+        return closing, covariance
+
+    def shared(self, loops: tuple[ArrayLike, ArrayLike], others: tuple[ArrayLike, ArrayLike]) -> Array:
+        """The covariance between how far off loops close and how far off others do, m x 3 x 3: by the displacements that both have, and what is wrong with all."""
+        (i, j), (k, m) = (tuple(np.asarray(steps, dtype=int) for steps in pair) for pair in (loops, others))
+        begin, end = np.maximum(i, k), np.minimum(j, m)
+        covariance = self._white(begin, np.maximum(begin, end), j, m)
+        return covariance + self._repeated((i, j), (k, m))
+
+    def _shared(self, i: Steps, j: Steps, end: Steps, other_end: Steps) -> Array:
+        """The covariance of closings by the displacements from i to j, for loops that end at these steps."""
+        return self._white(i, j, end, other_end) + self._repeated((i, j), (i, j))
+
+    def _white(self, i: Steps, j: Steps, end: Steps, other_end: Steps) -> Array:
+        """What the noise of the displacements after step i, up to j, contributes to the covariance between loops that end at two steps."""
+        sums = self.moments[j] - self.moments[i]
+        position, mixed, mixed_across = sums[:, :4].reshape(-1, 2, 2), sums[:, 4:6], sums[:, 6:10].reshape(-1, 2, 2)
+        angle, angle_across, angle_square = sums[:, 10], sums[:, 11:13], sums[:, 13:17].reshape(-1, 2, 2)
+        a, b = _quarter_turned(self.poses[end, :2]), _quarter_turned(self.poses[other_end, :2])
+        covariance = np.empty((len(sums), 3, 3))
+        covariance[:, :2, :2] = (
+            position
+            + mixed[:, :, None] * b[:, None, :]
+            - mixed_across
+            + a[:, :, None] * mixed[:, None, :]
+            - mixed_across.transpose(0, 2, 1)
+            + angle[:, None, None] * a[:, :, None] * b[:, None, :]
+            - a[:, :, None] * angle_across[:, None, :]
+            - angle_across[:, :, None] * b[:, None, :]
+            + angle_square
+        )
+        covariance[:, :2, 2] = mixed + angle[:, None] * a - angle_across
+        covariance[:, 2, :2] = mixed + angle[:, None] * b - angle_across
+        covariance[:, 2, 2] = angle
+        return covariance
+
+    def _repeated(self, loops: tuple[Steps, Steps], others: tuple[Steps, Steps]) -> Array:
+        """What a wrong scale and a steady drift contribute to the covariance between closings."""
+        scaled, other_scaled = (self._by_scale(*pair) for pair in (loops, others))
+        bent, other_bent = (self._by_bend(*pair) for pair in (loops, others))
+        by_scale: Array = self.odometry.scale**2 * scaled[:, :, None] * other_scaled[:, None, :]
+        return by_scale + self.drift**2 * bent[:, :, None] * other_bent[:, None, :]
+
+    def _closing(self, i: Steps, j: Steps) -> Array:
+        closing = self.poses[j] - self.poses[i]
+        closing[:, 2] = np.remainder(closing[:, 2] + math.pi, math.tau) - math.pi
+        return closing
+
+    def _by_scale(self, i: Steps, j: Steps) -> Array:
+        """How a scale that is wrong by 1 moves the end of each loop."""
+        return (self.poses[j] - self.poses[i]) * (1.0, 1.0, 0.0)
+
+    def _by_bend(self, i: Steps, j: Steps) -> Array:
+        """How a drift of 1 radian a metre moves the end of each loop."""
+        sums = self.ways[j] - self.ways[i]
+        return np.hstack([sums[:, :1] * _quarter_turned(self.poses[j, :2]) - sums[:, 1:], sums[:, :1]])
+
+    def _heading_variance(self, i: Steps, j: Steps) -> Array:
+        variance: Array = self.moments[j, 10] - self.moments[i, 10] + (self.drift * (self.ways[j, 0] - self.ways[i, 0])) ** 2
+        return variance
+
+    def _moved_by_heading(self, i: Steps, j: Steps) -> Array:
+        """The variance of the end of each loop, in both directions together, that comes of errors of heading."""
+        sums = self.moments[j] - self.moments[i]
+        end = _quarter_turned(self.poses[j, :2])
+        white = sums[:, 10] * (end**2).sum(1) - 2 * (end * sums[:, 11:13]).sum(1) + sums[:, 13] + sums[:, 16]
+        moved: Array = np.maximum(white, 0.0) + self.drift**2 * (self._by_bend(i, j)[:, :2] ** 2).sum(1)
+        return moved
+
+    @cached_property
+    def begins(self) -> Steps:
+        """For each step, the first step from which on it is known where this one is: no displacement is missing since, and the heading is not lost."""
+        angle, way, part = self.moments[:, 10].tolist(), self.ways[:, 0].tolist(), self.part.tolist()
+        begins, begin = [], 0
+        for t in range(len(part)):  # the beginning never goes back, as the heading gets no better
+            while part[begin] < part[t] or angle[t] - angle[begin] + (self.drift * (way[t] - way[begin])) ** 2 > LOST**2:
+                begin += 1
+            begins.append(begin)
+        return np.array(begins)
+
+    def unlost(self, first: Steps, last: Steps) -> NDArray[np.bool_]:
+        """Whether something is known of loops: no displacement in them is missing, and the heading is not lost."""
+        known: NDArray[np.bool_] = first >= self.begins[last]
+        return known
+
+
+def bends(trace: Trace) -> Iterator[tuple[Loops, float]]:
+    """The loops of a trace for each drift of heading that it may have, and the chi-square of that drift. No drift comes first."""
+    sigma = (trace.odometry or Odometry()).bend
+    if not sigma:
+        yield Loops.of(trace), 0.0
+        return
+    step = sigma / BENDS_A_SIGMA
+    for number in sorted(range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1), key=abs):
+        nearest = max(abs(number) - 0.5, 0.0) * step  # of the drifts that this one stands for
+        yield Loops.of(trace, number * step, step / 2), (nearest / sigma) ** 2
+
+
+def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
+    """For each closing, its chi-square by position alone (2 degrees of freedom), and by position and heading (3)."""
+    (a, b, p), (_, c, q), (_, _, s) = covariance.transpose(1, 2, 0)
+    x, y, turned = closing.T
+    determinant = a * c - b * b
+    by_position = (c * x * x - 2 * b * x * y + a * y * y) / determinant
+    gain_x, gain_y = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+    left = s - gain_x * p - gain_y * q
+    by_heading = (turned - gain_x * x - gain_y * y) ** 2 / left
+    return by_position, by_position + by_heading
+
+
+def _turned(vectors: Array, angles: Array) -> Array:
+    """Vectors, n x 2, turned counterclockwise by n angles."""
+    cos, sin = np.cos(angles), np.sin(angles)
+    return np.stack([cos * vectors[:, 0] - sin * vectors[:, 1], sin * vectors[:, 0] + cos * vectors[:, 1]], axis=1)
+
+
+def _quarter_turned(vectors: Array) -> Array:
+    """Vectors, n x 2, turned counterclockwise by a quarter."""
+    return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)
