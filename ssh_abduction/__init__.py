@@ -13,9 +13,10 @@ if TYPE_CHECKING:
     from ssh_abduction.engines.base import Cost
     from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
-    from ssh_abduction.maps import DState, Path, SSHMap
+    from ssh_abduction.maps import DState, Fit, Path, Pose, SSHMap
     from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
+    from ssh_abduction.rungs import Rung, ladder
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
     from ssh_abduction.solver.sharing import Backbone
@@ -28,9 +29,10 @@ _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
     "errors": ("MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
-    "maps": ("DState", "Path", "SSHMap"),
+    "maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
     "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
+    "rungs": ("Rung", "ladder"),
     "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
     "solver.sharing": ("Backbone",),
@@ -48,13 +50,16 @@ __all__ = [
     "Cost",
     "DState",
     "Evaluation",
+    "Fit",
     "Level",
     "MapError",
     "MapEvaluation",
     "Odometry",
     "OnlineMapper",
     "Path",
+    "Pose",
     "Progress",
+    "Rung",
     "SSHError",
     "SSHMap",
     "Search",
@@ -68,6 +73,7 @@ __all__ = [
     "Trace",
     "TraceError",
     "evaluate",
+    "ladder",
     "solve",
 ]
 
