@@ -91,6 +91,30 @@ def minimal_maps(trace: Trace, theory: Theory, allows: Callable[[Key], bool] = l
     return counts, keys
 
 
+def near_minimal_maps(
+    trace: Trace, theory: Theory, within: int, allows: Callable[[Key], bool] = lambda _: True
+) -> dict[tuple[int, ...], set[Key]]:
+    """By their cost: the maps that come first by `theory.priorities` among those with one number of dstates, in the order of these numbers.
+
+    within  how much greater that number may be than in minimal maps
+
+    Where the theory prefers few paths or places first, these are counted instead of dstates; where it prefers none of these, all maps have one number.
+    """
+    counted = next((name for name in theory.priorities if name != "excuses"), None)
+    best: dict[int, tuple[tuple[int, ...], set[Key]]] = {}  # by that number
+    for found, its_counts in consistent_maps(trace, theory):
+        if allows(found):
+            cost = tuple(getattr(its_counts, name) for name in theory.priorities)
+            number = getattr(its_counts, counted) if counted else 0
+            known = best.setdefault(number, (cost, set()))
+            if cost < known[0]:
+                best[number] = known = cost, set()
+            if cost == known[0]:
+                known[1].add(found)
+    least = min(((cost, number) for number, (cost, _) in best.items()), default=((), 0))[1]
+    return {cost: keys for number, (cost, keys) in sorted(best.items()) if least <= number <= least + within}
+
+
 def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]]:
     """Every map that satisfies the axioms, once, with its counts: excuses are the fewest that make it consistent."""
     theory = theory.resolve(trace)

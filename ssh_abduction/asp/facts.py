@@ -20,7 +20,7 @@ from ssh_abduction.steps.chart import Chart, FramedChart
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality, evidence_of
 from ssh_abduction.theory.speedups import TRAVELS_AND_TURNS
-from ssh_abduction.theory.theory import Theory
+from ssh_abduction.theory.theory import Count, Theory
 from ssh_abduction.trace import Action, Trace
 
 _COURSE = {"pos": 1, "neg": -1}
@@ -413,6 +413,49 @@ def forbidden_equalities(equalities: Iterable[Equality]) -> str:
     return f":- {', '.join(atoms)}."
 
 
+def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
+    """The rules that say: some doubt holds where this one is open, and two things are one (or are not); the condition of that is None where they never are."""
+    rules = [f"#external {open_doubt(number)}."]
+    rules += [f"one_in_doubt({number}) :- {condition}."] if condition else [f"#external one_in_doubt({number})."]
+    return "\n".join([*rules, f"{some_doubt(part)} :- {open_doubt(number)}, {'' if one else 'not '}one_in_doubt({number})."])
+
+
+def doubts_before(part: int) -> str:
+    """The rule that some doubt holds where some doubt of an earlier part does."""
+    return f"{some_doubt(part)} :- {some_doubt(part - 1)}." if part > 1 else f"#external {some_doubt(0)}."
+
+
+def steps_are_one(sort: str, i: int, j: int) -> str:
+    """The condition that two steps, the earlier one first, are one in the readable encodings: as to dstate, place, path or course. A step with itself: that it is along a path."""
+    return {
+        "dstates": f"same({i},{j})",
+        "places": f"same_place({i},{j})",
+        "paths": f"along({i},H,_), along({j},H,_)",
+        "courses": f"same_course({i},{j})",
+    }[sort]
+
+
+def open_doubt(number: int) -> Symbol:
+    """The external atom that a doubt is open."""
+    return Function("open_doubt", numbers(number))
+
+
+def some_doubt(part: int) -> Symbol:
+    """The atom that some open doubt of this part of a program or of an earlier one holds."""
+    return Function("some_doubt", numbers(part))
+
+
+def exactly(number: int, count: Count) -> str:
+    """The rule that a map has just so many dstates, places or paths, while `of_number` is true."""
+    counted = {"dstates": "T : is(T,T)", "places": "T : at(T,T)", "paths": "(T,H) : first_along(T,H)"}[count]
+    return f"#external {of_number(number, count)}.\n:- {of_number(number, count)}, #count {{ {counted} }} != {number}."
+
+
+def of_number(number: int, count: Count) -> Symbol:
+    """The external atom that says that maps have just so many dstates, places or paths."""
+    return Function("of_number", [Function(count), *numbers(number)])
+
+
 def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
     """The rule that these pairs of steps with names are not all one dstate. At a rest steps need not be one.
 
@@ -619,6 +662,17 @@ class PathReader:
         self._order: dict[int, list[int]] = {}  # for each path, its places in the answer that was read last
         self._placed: _Placed | None = None  # what the places of the last map tell, as they are mostly the same in the next
         self._made: dict[tuple[object, ...], DState] = {}  # dstates made so far, as most of them are in most maps
+
+    def condition(self, sort: str, i: int, j: int) -> str | None:
+        """The condition that two dstates of a map are one in the answer: as to place, path or course. None where they never are."""
+        if sort == "places":
+            return f"at({self._dstates[i][1]},P,_), at({self._dstates[j][1]},P,_)"
+        runs = {dstate: (segment, direction) for segment, members in self._runs.items() for dstate, direction in members}
+        if i not in runs or j not in runs:
+            return None
+        (g, d), (h, e) = runs[i], runs[j]
+        same_way = f", {d} * D == {e} * E" if sort == "courses" else ""
+        return f"course({g},H,D), course({h},H,E){same_way}"
 
     def read(self, model: Model) -> PathAnswer:
         """The values that map_of needs of an answer."""

@@ -9,10 +9,10 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import LimitError
+from ssh_abduction.asp.limits import LimitError, StageTimeError
 from ssh_abduction.engines.base import Engine, Found, Task
 from ssh_abduction.engines.refusing import first_accepted
-from ssh_abduction.engines.stepwise import StepEngine
+from ssh_abduction.engines.stepwise import StepEngine, paths_needed
 from ssh_abduction.judge.checker import turned
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.judging import Judging
@@ -116,26 +116,13 @@ class Prefixes:
 
     def _name_more_paths(self, cost: tuple[int, ...] | None) -> bool:
         """Take a control with more names for paths, if the minimal cost found needs them. Says whether it was so."""
-        needed = self._paths_needed(cost)
+        needed = paths_needed(self._task, self.engine.size, cost)
         if needed <= self.engine.paths:
             return False
         size = self.engine.size
         self.engine = self.engine.with_paths(needed)
         self.engine.grow(size)
         return True
-
-    def _paths_needed(self, cost: tuple[int, ...] | None) -> int:
-        """How many names for paths it takes to be sure that no map of the prefix has another cost, or is missed at this one."""
-        theory = self._task.theory
-        segments = facts.most_paths(self._task.trace, theory, self.engine.size)
-        first = theory.priorities[0] if theory.priorities else None
-        if theory.level == "causal":
-            return 0
-        if cost is None or not self._task.speedups.path_names or first not in ("paths", "dstates"):
-            return segments
-        if first == "paths":
-            return cost[0]
-        return min(segments, cost[0] // (1 if "course_needs_travel" in theory.given_up else 2))
 
     def minimal_maps(self) -> Iterator[SSHMap]:
         """Every map of minimal cost, once, after those of the longest prefix that is needed have been seen to replay."""
@@ -149,7 +136,7 @@ class Prefixes:
                     break
                 self.engine.grow(self.engine.next_size(stuck))
                 self._name_more_paths(self._known.cost)
-        except LimitError:
+        except (LimitError, StageTimeError):
             yield from held  # they replay at the proven cost: they are minimal
             raise
         yield from held
