@@ -106,6 +106,7 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "path_order": st.sampled_from(["partial", "total"]),
         "next_place": st.booleans(),
         "all_on_paths": st.booleans(),
+        "planar": st.booleans(),
         "star": st.sampled_from(["auto", "none", "pattern", "frame"] if trace.has_stars else ["auto", "none"]),
         "prefer": st.permutations(COUNTS).flatmap(lambda order: st.integers(0, len(order)).map(lambda length: order[:length])),
         "without": _seldom(st.sampled_from(LEFT_OUT).map(lambda name: (name,))),

@@ -170,6 +170,7 @@ SURVIVE_A_CUT = FRAMES | {
     "side_of_branch, excusable",
     "sides_disjoint",
     "path_between_sides",
+    "planar",
     "asserted",
     "asserted same",
 }
@@ -198,7 +199,7 @@ TABLE = (
         "Places with frames: settle dstates, as visits that are one, before places and paths.",
         _has_frames,
         FRAMES,
-        _kept_by("visits", "sides_framed", "paths_framed", and_also=["asserted"]),
+        _kept_by("visits", "sides_framed", "paths_framed", and_also=["asserted", "planar"]),
     ),
     Speedup(
         "ways",
@@ -206,7 +207,7 @@ TABLE = (
         "Places without stars: where clingo takes its time, settle dstates before places and paths, with names.",
         _has_bare_places,
         PLACES,
-        _kept_by("names", "sides_frameless", "paths_frameless", and_also=["asserted"]),
+        _kept_by("names", "sides_frameless", "paths_frameless", and_also=["asserted", "planar"]),
     ),
     Speedup(
         "clique",
@@ -245,7 +246,7 @@ TABLE = (
         "While a robot drives: a map made without a search is consistent as it is made, and is not checked.",
         _keeps_headings,
         PLACES - {"course_needs_travel"},
-        lambda: SURVIVE_A_CUT - {"asserted", "asserted same"},
+        lambda: SURVIVE_A_CUT - {"planar", "asserted", "asserted same"},
     ),
     Speedup(
         "framing",

@@ -13,14 +13,15 @@ variables (`Pairs`), so that evidence makes solving faster. What it finds out on
 from __future__ import annotations
 
 from ssh_abduction.theory.evidence.asserted import Asserted
+from ssh_abduction.theory.evidence.planar import Planar
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
-KINDS: tuple[type[Evidence], ...] = (Asserted,)
+KINDS: tuple[type[Evidence], ...] = (Asserted, Planar)
 
-__all__ = ["KINDS", "NO_PAIRS", "Asserted", "Equality", "Evidence", "Pairs", "evidence_of", "pairs_of"]
+__all__ = ["KINDS", "NO_PAIRS", "Asserted", "Equality", "Evidence", "Pairs", "Planar", "evidence_of", "pairs_of"]
 
 
 def evidence_of(theory: Theory) -> tuple[Evidence, ...]:

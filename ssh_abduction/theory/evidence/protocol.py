@@ -15,11 +15,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Equality:
-    """That two steps are at one dstate, or at one place."""
+    """That two steps are at one dstate, or at one place; or that they are not."""
 
     first: int
     second: int
     of: str = "dstate"
+    holds: bool = True
 
 
 class Evidence(Protocol):
