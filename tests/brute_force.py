@@ -406,21 +406,21 @@ def _sides_allowed(
     return True
 
 
-# --- planarity: whether some orders of the streets around the places make a drawing without crossings
+# --- planarity: whether some orders of the edges around the places make a drawing without crossings
 
-Street: TypeAlias = frozenset[tuple[int, object]]  # the gateways at its ends: a place, and a slot or an arm; one where it comes back to its gateway
+Edge: TypeAlias = frozenset[
+    tuple[int, object]
+]  # the gateways at its ends: a place, and a slot or an arm; one where it comes back to its gateway
 
 
-def _is_planar(
-    labels: Labels, places: tuple[int, ...], links: frozenset[Link], headings: list[tuple[int, ...]], theory: Theory
-) -> bool:
-    """Whether the streets that travels lead along can be drawn. By headings where places have frames; if not, by sides."""
+def _is_planar(labels: Labels, places: tuple[int, ...], links: frozenset[Link], headings: list[tuple[int, ...]], theory: Theory) -> bool:
+    """Whether the edges that travels lead along can be drawn. By headings where places have frames; if not, by sides."""
     travels = {(s, t) for s, action, t in links if action.kind == "travel"}
     if theory.star == "frame":
         for heading in headings:
             facing = dict(zip(labels, heading, strict=True))
-            streets = {frozenset({(places[s], facing[s]), (places[t], (facing[t] + 2) % 4)}) for s, t in travels}
-            if _is_drawing(streets, dict.fromkeys(places, SLOTS)):
+            edges = {frozenset({(places[s], facing[s]), (places[t], (facing[t] + 2) % 4)}) for s, t in travels}
+            if _is_drawing(edges, dict.fromkeys(places, SLOTS)):
                 return True
         return False
     supported = _supported(frozenset(link for link in links if link[1].kind == "travel" or places[link[0]] == places[link[2]]))
@@ -442,7 +442,7 @@ def _is_planar(
                 if places[other[0]] != places[there[0]]:
                     return False
                 merge(other, there)
-    streets = {frozenset({(places[s], arms[s, 1]), (places[t], arms[t, -1])}) for s, t in travels}
+    edges = {frozenset({(places[s], arms[s, 1]), (places[t], arms[t, -1])}) for s, t in travels}
     rounds: list[set[tuple[object, ...]]] = []
     for p in sorted(set(places)):
         told: list[list[tuple[int, int]]] = []  # arms one after another, clockwise
@@ -452,10 +452,10 @@ def _is_planar(
                 ends = [(s, 1), right, (s, -1), left]
                 told.append([arms[end] for end in ends if theory.symmetric_sides or end != (t, -1)])
         here = sorted({arms[s, side] for s in supported if places[s] == p for side in (1, -1)})
-        used = {arm for street in streets for q, arm in street if q == p}
+        used = {arm for edge in edges for q, arm in edge if q == p}
         good = [order for order in permutations(here) if order[:1] == tuple(here[:1]) and all(_clockwise(order, ends) for ends in told)]
         rounds.append({tuple(arm for arm in order if arm in used) for order in good})
-    return any(_is_drawing(streets, dict(zip(sorted(set(places)), choice, strict=True))) for choice in product(*rounds))
+    return any(_is_drawing(edges, dict(zip(sorted(set(places)), choice, strict=True))) for choice in product(*rounds))
 
 
 def _clockwise(order: tuple[object, ...], ends: list[tuple[int, int]]) -> bool:
@@ -465,14 +465,14 @@ def _clockwise(order: tuple[object, ...], ends: list[tuple[int, int]]) -> bool:
     return len(set(turned)) == len(ends) and turned == sorted(turned)
 
 
-def _is_drawing(streets: set[Street], rounds: dict[int, tuple[object, ...]]) -> bool:
-    """Whether each gateway has one street, and V - E + F = 2 for each connected part.
+def _is_drawing(edges: set[Edge], rounds: dict[int, tuple[object, ...]]) -> bool:
+    """Whether each gateway has one edge, and V - E + F = 2 for each connected part.
 
     rounds  the gateways around each place, clockwise
     """
-    numbered = [sorted(street, key=repr) for street in streets]
-    ends = {(i, k): street[k % len(street)] for i, street in enumerate(numbered) for k in (0, 1)}
-    if any(streets_there > 1 for streets_there in Counter(gateway for street in streets for gateway in street).values()):
+    numbered = [sorted(edge, key=repr) for edge in edges]
+    ends = {(i, k): edge[k % len(edge)] for i, edge in enumerate(numbered) for k in (0, 1)}
+    if any(edges_there > 1 for edges_there in Counter(gateway for edge in edges for gateway in edge).values()):
         return False
     places = {p for p, _ in ends.values()}
     after: dict[tuple[int, int], tuple[int, int]] = {}

@@ -1,10 +1,10 @@
-"""Judges whether the streets of a map can be drawn in the plane without a crossing.
+"""Judges whether the edges of a map can be drawn in the plane without a crossing.
 
->>> theta = [(0, 1), (2, 3), (4, 5)]
->>> place_of = {0: 0, 1: 1, 2: 1, 3: 0, 4: 0, 5: 1}
->>> Streets(theta, [(1, "right", 2), (3, "left", 4)], place_of).can_be_drawn(crossing=True)
+>>> there_back_and_there = [(0, 1), (2, 3), (4, 5)]
+>>> edges = Edges(there_back_and_there, [], {0: 0, 1: 1, 2: 1, 3: 0, 4: 0, 5: 1})
+>>> edges.can_be_drawn_by({0: 1, 1: 1, 2: 0, 3: 2, 4: 3, 5: 3})
 True
->>> Streets(theta, [(1, "right", 2), (3, "right", 4)], place_of).can_be_drawn(crossing=True)
+>>> edges.can_be_drawn_by({0: 1, 1: 1, 2: 2, 3: 2, 4: 3, 5: 2})
 False
 
 A travel leads from the arm ahead of one dstate to the arm behind another one. Arms lie around a place in some order, and some of them may be one gateway. For
@@ -26,7 +26,7 @@ Option: TypeAlias = Mapping[Arm, int]  # the position of each arm around its pla
 QUARTERS = {"right": 1, "around": 2, "left": 3}
 
 
-class Streets:
+class Edges:
     """The travels and turns of a map.
 
     travels   from a dstate to a dstate
@@ -73,17 +73,17 @@ class Streets:
     def can_be_drawn(self, *, crossing: bool) -> bool:
         """Whether some orders of gateways make such a drawing, where turns tell no more than sides.
 
-        crossing  a turn leads from one street to another that crosses it, rather than to a branch of it
+        crossing  a turn leads from one edge to another that crosses it, rather than to a branch of it
         """
         one = self._gateways()
         if one is None:
             return False
-        on_street = {s for s, _ in self._used}
-        while more := {x for s, turn, t in self.turns if turn == "around" and {s, t} & on_street for x in (s, t)} - on_street:
-            on_street |= more
+        at_edge = {s for s, _ in self._used}
+        while more := {x for s, turn, t in self.turns if turn == "around" and {s, t} & at_edge for x in (s, t)} - at_edge:
+            at_edge |= more
         told: dict[int, list[list[Arm]]] = defaultdict(list)  # gateways of each place that are met one after another, clockwise
         for s, turn, t in self.turns:
-            if turn != "around" and {s, t} <= on_street:
+            if turn != "around" and {s, t} <= at_edge:
                 side = 1 if turn == "right" else -1
                 arms = [(s, 1), (t, side), (s, -1), (t, -side)]
                 told[self.place_of[s]].append([one[arm] for arm in arms if crossing or arm != (t, -1)])
@@ -91,9 +91,9 @@ class Streets:
         for p, here in self._at.items():
             ends = {one[arm] for arm in self._used if self.place_of[arm[0]] == p}
             found: dict[tuple[Arm, ...], Option] = {}
-            for order in _orders(sorted(ends | {gateway for gateways in told[p] for gateway in gateways}), told[p]):
+            for order in _orders(sorted(ends | {gateway for gateways in told[p] for gateway in gateways}, key=repr), told[p]):
                 kept = [gateway for gateway in order if gateway in ends]
-                start = kept.index(min(kept)) if kept else 0
+                start = kept.index(min(kept, key=repr)) if kept else 0
                 position = {gateway: i for i, gateway in enumerate(kept)}
                 found.setdefault((*kept[start:], *kept[:start]), {arm: position[one[arm]] for arm in self._used if arm[0] in here})
             options.append(list(found.values()))
@@ -149,8 +149,8 @@ class Streets:
             if (s, 1) in position and (t, -1) in position
         }
         beyond: dict[tuple[int, int], tuple[int, int]] = {}
-        for street in joined:
-            first, *_, last = *street, *street
+        for edge in joined:
+            first, *_, last = *edge, *edge
             for here, there in ((first, last), (last, first)):
                 if beyond.setdefault(here, there) != there:
                     return False
@@ -158,7 +158,7 @@ class Streets:
         for gateway in sorted(beyond):
             around[gateway[0]].append(gateway)
         after = {gateway: gateways[i - 1] for gateways in around.values() for i, gateway in enumerate(gateways)}  # counterclockwise
-        places = len(around) + sum(len(street) == 1 for street in joined)  # a street that leads back to its gateway turns at a place of its own
+        places = len(around) + sum(len(edge) == 1 for edge in joined)  # an edge that leads back to its gateway turns at a place of its own
         return places - len(joined) + _cycles({gateway: after[other] for gateway, other in beyond.items()}) == 2 * _parts(around, beyond)
 
 

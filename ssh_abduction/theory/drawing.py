@@ -1,7 +1,7 @@
-"""Whether streets between places can be drawn in the plane without a crossing, where it is known in part how they lie around a place.
+"""Whether edges between places can be drawn in the plane without a crossing, where it is known in part how they lie around a place.
 
->>> three_streets = [("a", "b"), ("a", "b"), ("a", "b")]
->>> can_be_drawn(three_streets, lambda place, ends: True)
+>>> three_edges = [("a", "b"), ("a", "b"), ("a", "b")]
+>>> can_be_drawn(three_edges, lambda place, ends: True)
 True
 >>> is_planar({"a": (0, 2, 4), "b": (5, 3, 1)}), is_planar({"a": (0, 2, 4), "b": (1, 3, 5)})
 (True, False)

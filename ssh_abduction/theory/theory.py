@@ -61,7 +61,7 @@ class Theory:
     all_on_paths     every dstate is along a path, even one that no travel starts or ends at
     star             the openings seen at a place: none, pattern (agree up to rotation), frame (agree when turned by the
                      heading, and paths go straight on); auto is frame where the trace has stars, and none elsewhere
-    planar           streets meet at places only: the map can be drawn in the plane, with turns right to the right, without a crossing
+    planar           paths meet at places only: the map can be drawn in the plane, with turns right to the right, without a crossing
     prefer           what is minimised, first to last: dstates, paths, places, and with boundary=defeasible excuses, which go first
                      unless they are named; what is not named is not minimised
     without          names of axioms left out, to see what they do

@@ -1,13 +1,17 @@
-"""Streets meet at places only: a map can be drawn in the plane, with turns right to the right, without a crossing.
+"""Paths meet at places only: a map can be drawn in the plane, with turns right to the right, without a crossing.
 
 >>> from ssh_abduction import Theory, Trace, solve
->>> trace = Trace.from_steps("abaabba", ["travel", "left", "travel", "left", "travel", "left"])
+>>> trace = Trace.from_steps("aaaaa", ["travel", "around", "travel", "around"])
+>>> [len(solve(trace, Theory(planar=planar, prefer=())).maps) for planar in (False, True)]
+[2, 1]
 
-Each two gateways that a travel joins are the ends of a street. Their order around a place is told by turns, and where places have frames by stars, too; where it is
-not, any order will do. So a map is planar if *some* orders make a drawing of it: a cut to first steps keeps it planar, as it takes streets away.
+A travel leads along an edge from a gateway of one place to a gateway of another, and no edge passes a place unseen: a gateway leads to one other gateway.
+Around a place, the order of gateways is told by turns, and where places have frames by stars, too; where it is not told, any order will do. So a map is planar if
+*some* orders make a drawing of it. A map of first steps has fewer edges, and what it says of orders the whole map says, too: a cut keeps a map planar.
 
-What is refused is more than equalities: two streets that cross may do so at a place where the map says that there are two. So that steps are *not* at one place
-is said, too. It is read off as few travels and turns as cross already.
+To take an equality of places away may make a planar map one that is not: edges that crossed at a place now cross elsewhere. So what cannot be is, that some
+steps are at one place while others are at different ones. It is read off as few travels and turns as cross by themselves. For the places given, an equality of dstates
+only takes drawings away; so of those only as few are said as let the edges cross.
 """
 
 from __future__ import annotations
@@ -15,8 +19,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations, product
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from itertools import combinations, pairwise, product
+from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
 
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.drawing import Ends, can_be_drawn, has_way, is_planar
@@ -27,14 +31,18 @@ from ssh_abduction.trace import Openings, Trace
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
+Side = TypeVar("Side", bound=Hashable)
+
 QUARTERS = {"right": 1, "around": 2, "left": 3}
 SLOTS = 4
 BEHIND = 2  # so many slots from the one that is faced
 
 AHEAD, BACK = 1, -1
-End: TypeAlias = tuple[int, int, int]  # of a street: its place, the group of dstates that it is known from, and its slot as that group has it
+End: TypeAlias = tuple[
+    int, int, int
+]  # of an edge: its place, the group of dstates that it is known from, and its slot as that group has it
 Arm: TypeAlias = tuple[int, int]  # what is ahead of a dstate, or back
-Gateway: TypeAlias = tuple[int, Hashable]  # of a place: a slot or an arm
+Gateway: TypeAlias = tuple[int, Arm]  # of a place, and one of its arms that are this gateway
 
 
 @dataclass(frozen=True)
@@ -45,7 +53,7 @@ class Planar:
     turns     turns tell what they tell
     stars     stars seen at a place agree, each turned by its heading
     distinct  no two dstates face one slot
-    crossing  without frames: where a turn leads from one street to another, these cross
+    crossing  without frames: where a turn leads from one edge to another, these cross
     """
 
     name: ClassVar[str] = "planar"
@@ -75,7 +83,7 @@ class Planar:
 
     def refuse(self, trace: Trace, ssh_map: SSHMap) -> frozenset[Equality] | None:
         places = [ssh_map.dstates[label].place for label in ssh_map.labels]
-        labels = dict(enumerate(ssh_map.labels))
+        labels: Mapping[int, int] = dict(enumerate(ssh_map.labels))
         moves = _first_moves(trace, ssh_map.labels)
         at = {t: place for t, place in enumerate(places) if place is not None}
         if len(at) < len(places) or not self._cross(trace, moves, labels, at, self.distinct):
@@ -102,7 +110,7 @@ class Planar:
 def _first_moves(trace: Trace, labels: Sequence[int]) -> list[int]:
     """The steps at which the travels and turns of a map were first done."""
     first: dict[tuple[int, str, int], int] = {}
-    for t, (here, there) in enumerate(zip(labels, labels[1:], strict=False)):
+    for t, (here, there) in enumerate(pairwise(labels)):
         action = trace.steps[t].action
         if action is not None and action.kind is not None:
             first.setdefault((here, action.name, there), t)
@@ -139,15 +147,15 @@ class _Shown:
 
 
 def _can_draw_framed(shown: _Shown, turns: bool, distinct: bool) -> bool:
-    """Whether there are headings with which the streets can be drawn. Dstates that turns link are turned to each other as the turns say; how others are turned is
+    """Whether there are headings with which the edges can be drawn. Dstates that turns link are turned to each other as the turns say; how others are turned is
     open, unless stars tell.
     """
     group, slot, agree = _groups(shown, turns)
     ahead = {s: (place, group[s], slot[s]) for s, place in shown.places.items()}
     behind = {s: (place, group[s], (slot[s] + BEHIND) % SLOTS) for s, place in shown.places.items()}
-    streets = {(ahead[x], behind[y]): None for x, y in shown.travels}
+    edges = {(ahead[x], behind[y]): None for x, y in shown.travels}
     ends: dict[int, list[End]] = {place: [] for place in shown.places.values()}
-    for end in dict.fromkeys(end for street in streets for end in street):
+    for end in dict.fromkeys(end for edge in edges for end in edge):
         ends[end[0]].append(end)
     choices = {place: _slots_of(shown, group, slot, place, ends[place], distinct) for place in ends}
     if not agree or not all(choices.values()):
@@ -156,15 +164,15 @@ def _can_draw_framed(shown: _Shown, turns: bool, distinct: bool) -> bool:
     left = [place for place, slots in choices.items() if len(slots) > 1]
 
     def ways(chosen: dict[End, int], place: int) -> Iterator[dict[End, int]]:
-        return (more for slots in choices[place] if _is_drawing(streets, more := chosen | slots))
+        return (more for slots in choices[place] if _is_drawing(edges, more := chosen | slots))
 
-    return _is_drawing(streets, fixed) and has_way(fixed, sorted(left, key=lambda place: len(choices[place])), ways)
+    return _is_drawing(edges, fixed) and has_way(fixed, sorted(left, key=lambda place: len(choices[place])), ways)
 
 
 def _slots_of(
     shown: _Shown, group: Mapping[int, int], slot: Mapping[int, int], place: int, ends: Sequence[End], distinct: bool
 ) -> list[dict[End, int]]:
-    """The slots that the ends of streets at a place may have, up to turning the place."""
+    """The slots that the ends of edges at a place may have, up to turning the place."""
     here = [s for s in shown.places if shown.places[s] == place]
     groups = list(dict.fromkeys(group[s] for s in here))
     found: dict[tuple[int, ...], dict[End, int]] = {}
@@ -178,21 +186,21 @@ def _slots_of(
     return list(found.values())
 
 
-def _is_drawing(streets: Iterable[tuple[End, End]], slots: Mapping[End, int]) -> bool:
-    """Whether the streets both ends of which have slots join each gateway to one other, and do not cross."""
-    joined = {frozenset((end[0], slots[end]) for end in street) for street in streets if street[0] in slots and street[1] in slots}
+def _is_drawing(edges: Iterable[tuple[End, End]], slots: Mapping[End, int]) -> bool:
+    """Whether the edges both ends of which have slots join each gateway to one other, and do not cross."""
+    joined = {frozenset((end[0], slots[end]) for end in edge) for edge in edges if edge[0] in slots and edge[1] in slots}
     if not _are_paired(joined):
         return False
     around: dict[int, list[tuple[int, int]]] = {}
-    for number, street in enumerate(joined):
-        for side, (place, k) in enumerate(tuple(street) * (3 - len(street))):
+    for number, edge in enumerate(joined):
+        for side, (place, k) in enumerate(tuple(edge) * (3 - len(edge))):
             around.setdefault(place, []).append((k, 2 * number + side))
     return is_planar({place: tuple(end for _, end in sorted(ends)) for place, ends in around.items()})
 
 
-def _are_paired(streets: Collection[frozenset[Gateway]]) -> bool:
-    """Whether each gateway is the end of one street."""
-    return len({gateway for street in streets for gateway in street}) == sum(map(len, streets))
+def _are_paired(edges: Collection[frozenset[Side]]) -> bool:
+    """Whether each gateway is the end of one edge."""
+    return len({gateway for edge in edges for gateway in edge}) == sum(map(len, edges))
 
 
 def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int], bool]:
@@ -217,26 +225,26 @@ def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int],
 
 
 def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
-    """Whether there are orders of gateways with which the streets can be drawn, by sides: a turn tells which gateway is to the right of a street, where both dstates
-    are on a street. Who turns around faces the gateway that was behind.
+    """Whether there are orders of gateways with which the edges can be drawn, by sides: a turn tells which gateway is to the right of an edge, where both dstates
+    are at an edge. Who turns around faces the gateway that was behind.
 
-    crossing  where a turn leads from one street to another, these cross
+    crossing  where a turn leads from one edge to another, these cross
     """
     same = _Classes()
     for x, turn, y in shown.turns:
         if turn == "around":
             same.join((x, AHEAD), (y, BACK))
-    streets = _paired(shown, same)
-    if streets is None:
+    edges = _paired(shown, same)
+    if edges is None:
         return False
     clockwise: dict[int, list[list[Arm]]] = {place: [] for place in shown.places.values()}
-    on_street = _on_streets(shown)
+    at_edge = _at_edges(shown)
     for x, turn, y in shown.turns:
-        if turn != "around" and x in on_street and y in on_street:
+        if turn != "around" and x in at_edge and y in at_edge:
             right, left = ((y, AHEAD), (y, BACK)) if turn == "right" else ((y, BACK), (y, AHEAD))
             told = [(x, AHEAD), right, (x, BACK), left]
             clockwise[shown.places[x]].append([same.of(arm) for arm in told if crossing or arm != (y, BACK)])
-    ends = [end for street in streets for end in tuple(street) * (3 - len(street))]
+    ends = [end for edge in edges for end in tuple(edge) * (3 - len(edge))]
 
     @cache
     def allows(place: int, order: Ends) -> bool:
@@ -248,25 +256,25 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
 
 
 def _paired(shown: _Shown, same: _Classes) -> list[frozenset[Gateway]] | None:
-    """The streets, each of which joins one gateway to one other, once gateways at one place to which one gateway leads are said to be one; None where it leads to
+    """The edges, each of which joins one gateway to one other, once gateways at one place to which one gateway leads are said to be one; None where it leads to
     gateways at different places.
     """
     joined = [((shown.places[x], (x, AHEAD)), (shown.places[y], (y, BACK))) for x, y in shown.travels]
     while True:
-        streets = list(dict.fromkeys(frozenset((p, same.of(arm)) for p, arm in street) for street in joined))
+        edges = list(dict.fromkeys(frozenset((p, same.of(arm)) for p, arm in edge) for edge in joined))
         beyond: dict[Gateway, Gateway] = {}
-        for street in streets:
-            ends = tuple(street) * (3 - len(street))
+        for edge in edges:
+            ends = tuple(edge) * (3 - len(edge))
             for end, other in (ends, ends[::-1]):
                 first = beyond.setdefault(end, other)
                 if first[0] != other[0]:
                     return None
                 same.join(first[1], other[1])
-        if _are_paired(streets):
-            return streets
+        if _are_paired(edges):
+            return edges
 
 
-def _on_streets(shown: _Shown) -> set[int]:
+def _at_edges(shown: _Shown) -> set[int]:
     """The dstates that a travel starts or ends at, and those that turns around link to them."""
     found = {dstate for travel in shown.travels for dstate in travel}
     around = [{x, y} for x, turn, y in shown.turns if turn == "around"]
@@ -329,7 +337,7 @@ def _fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
 
 
 def _split(labels: Mapping[int, int], steps: Sequence[int], cross: Callable[[Mapping[int, int]], bool]) -> Mapping[int, int]:
-    """Labels of these steps by which as few of them are one dstate as let the streets cross still."""
+    """Labels of these steps by which as few of them are one dstate as let the edges cross still."""
     new = max(labels.values()) + 1
     for step in steps:
         finer = {**labels, step: new + step}
