@@ -42,5 +42,5 @@ class Evidence(Protocol):
         ...
 
     def refuse(self, trace: Trace, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """A small set of equalities of a map of the first steps that cannot all hold, whatever the map; None if there is none."""
+        """A small set of equalities of a map of the first steps, and of what is not equal (`holds` is False), that cannot all hold, whatever the map; None if there is none."""
         ...
