@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from dataclasses import replace
 from itertools import combinations
+from typing import Literal
 from unittest.mock import patch
 
 import networkx as nx
@@ -12,12 +13,14 @@ import pytest
 from brute_force import consistent_maps, key, minimal_maps
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from instances import maze
 from map_trees import DIRECTIONS, Cells, Joined, lattice, levels, passes_no_place_twice, stars_on
 from worlds import ACTIONS, HEADINGS, QUARTERS, drive, streets
 
 from ssh_abduction import OnlineMapper, Solution, SSHMap, Status, Theory, Trace, solve
 from ssh_abduction.judge import check
 from ssh_abduction.judge.planarity import Edges
+from ssh_abduction.maps import DState
 from ssh_abduction.solver import prefixes, search
 from ssh_abduction.theory.drawing import can_be_drawn, is_planar
 from ssh_abduction.theory.evidence import Equality, Planar
@@ -352,6 +355,20 @@ def test_what_is_refused_speaks_of_few_steps_and_tells_their_places_apart(tour: 
     assert len(place) < len(tour)
     apart = {frozenset((place[e.first], place[e.second])) for e in reason if not e.holds}
     assert apart == {frozenset(pair) for pair in combinations(sorted(set(place.values()), key=str), 2)}
+
+
+@pytest.mark.parametrize("star", ["frame", "none"])
+@pytest.mark.parametrize("follow", [True, False])
+@pytest.mark.parametrize(("cells", "steps"), [(4, 60), (8, 300)])
+def test_the_true_map_of_a_maze_is_not_refused(cells: int, steps: int, follow: bool, star: Literal["frame", "none"]) -> None:
+    """However much is open of the order of gateways where places have no frames."""
+    walk = maze(cells, cells, steps=steps, seed=101, stars=True, follow=follow)
+    number: dict[tuple[int, ...], int] = {}
+    places: dict[tuple[int, ...], int] = {}
+    labels = tuple(number.setdefault(state, len(number)) for state in walk.truth)
+    dstates = tuple(DState(i, "", places.setdefault(state[:2], len(places))) for state, i in number.items())
+    assert len(places) > cells
+    assert Planar.of(Theory(planar=True, star=star)).refuse(walk.trace, SSHMap(labels, dstates, ())) is None
 
 
 @pytest.mark.parametrize(("planar", "expected"), [(False, {0, 1}), (True, {1})])

@@ -7,9 +7,10 @@ True
 >>> edges.can_be_drawn_by({0: 1, 1: 1, 2: 2, 3: 2, 4: 3, 5: 2})
 False
 
-A travel leads from the arm ahead of one dstate to the arm behind another one. Arms lie around a place in some order, and some of them may be one gateway. For
-each place this module makes all orders that turns and stars leave open, and tries them, place by place: with the right ones each gateway is joined to one
-other, and V - E + F = 2 for each connected part (Heffter, Edmonds; see Mohar & Thomassen, Graphs on Surfaces, 2001).
+A travel leads from the arm ahead of one dstate to the arm behind another one. Arms lie around a place in some order, and some of them may be one gateway. Where places
+have frames this module makes all headings that turns and stars leave open, and tries them, place by place: with the right ones each gateway is joined to one
+other, and V - E + F = 2 for each connected part (Heffter, Edmonds; see Mohar & Thomassen, Graphs on Surfaces, 2001). Without frames it makes the orders that
+sides leave open, and shares with the evidence what seeks a drawing with them (theory/drawing.py), which the tests compare with networkx and with a brute force.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
+from ssh_abduction.theory.drawing import can_be_drawn
 from ssh_abduction.trace import Openings
 
 Arm: TypeAlias = tuple[int, int]  # of a dstate, ahead (1) or behind (-1)
@@ -87,17 +89,14 @@ class Edges:
                 side = 1 if turn == "right" else -1
                 arms = [(s, 1), (t, side), (s, -1), (t, -side)]
                 told[self.place_of[s]].append([one[arm] for arm in arms if crossing or arm != (t, -1)])
-        options: list[list[Option]] = []
-        for p, here in self._at.items():
-            ends = {one[arm] for arm in self._used if self.place_of[arm[0]] == p}
-            found: dict[tuple[Arm, ...], Option] = {}
-            for order in _orders(sorted(ends | {gateway for gateways in told[p] for gateway in gateways}, key=repr), told[p]):
-                kept = [gateway for gateway in order if gateway in ends]
-                start = kept.index(min(kept, key=repr)) if kept else 0
-                position = {gateway: i for i, gateway in enumerate(kept)}
-                found.setdefault((*kept[start:], *kept[:start]), {arm: position[one[arm]] for arm in self._used if arm[0] in here})
-            options.append(list(found.values()))
-        return self._some_option_draws(options)
+        edges = {frozenset(((self.place_of[s], one[s, 1]), (self.place_of[t], one[t, -1]))) for s, t in self.travels}
+        ends = [choose(edge, key=repr) for edge in edges for choose in (min, max)]
+        orders = {p: _orders(sorted({arm for arms in told[p] for arm in arms}, key=repr), told[p]) for p in self._at}
+
+        def allows(place: int, some: Sequence[int]) -> bool:
+            return any(_goes_round(order, list(dict.fromkeys(ends[end][1] for end in some))) for order in orders[place])
+
+        return can_be_drawn([(p, q) for (p, _), (q, _) in zip(ends[::2], ends[1::2], strict=True)], allows)
 
     def _gateways(self) -> dict[Arm, Arm] | None:
         """For each arm, one that stands for its gateway: who turns around faces what was behind, and a gateway leads to one gateway. None if it leads to two places."""

@@ -14,6 +14,7 @@ connected part (Euler; Edmonds 1960; Mohar & Thomassen, Graphs on Surfaces, 2001
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import TypeAlias, TypeVar
 
 Ends: TypeAlias = tuple[int, ...]
@@ -70,7 +71,12 @@ def can_be_drawn(edges: Sequence[tuple[Place, Place]], allows: Callable[[Place, 
     place_of = [place for edge in edges for place in edge]
     if not all(allows(place, ()) for place in set(place_of)):
         return False
-    return all(_can_draw_part(part, place_of, allows) for part in _in_order(_on_rings(place_of), place_of))
+    ends_at: dict[Place, list[int]] = {}
+    for end in sorted(end for edge in _on_rings(place_of) for end in (2 * edge, 2 * edge + 1)):
+        ends_at.setdefault(place_of[end], []).append(end)
+    orders = {place: _orders(ends, partial(allows, place)) for place, ends in ends_at.items()}
+    nothing: dict[Place, Ends] = {}
+    return has_way(nothing, range(len(orders)), lambda drawn, _: _one_place_more(drawn, orders, place_of))
 
 
 def _on_rings(place_of: Sequence[Place]) -> set[int]:
@@ -88,37 +94,70 @@ def _on_rings(place_of: Sequence[Place]) -> set[int]:
     return {end // 2 for ends in ends_at.values() for end in ends}
 
 
-def _in_order(edges: set[int], place_of: Sequence[Place]) -> Iterator[list[int]]:
-    """The edges of each connected part, in an order in which each is joined to those before it, and rings are closed as soon as they can be."""
-    edges_at: dict[Place, list[int]] = {}
-    for edge in sorted(edges):
-        for end in (2 * edge, 2 * edge + 1):
-            edges_at.setdefault(place_of[end], []).append(edge)
-    reached: set[Place] = set()
-    for first in edges_at:
-        part: dict[int, None] = {}
-        closing: list[int] = []
-        leaving: list[int] = []
-        new = {first} - reached
-        while new or closing or leaving:
-            for place in new:
-                reached.add(place)
-                for edge in edges_at[place]:
-                    closes = place_of[2 * edge] in reached and place_of[2 * edge + 1] in reached
-                    (closing if closes else leaving).append(edge)
-            new = set()
-            if closing or leaving:
-                edge = closing.pop() if closing else leaving.pop()
-                part[edge] = None
-                new = {place_of[2 * edge], place_of[2 * edge + 1]} - reached
-        if part:
-            yield list(part)
+def _orders(ends: Sequence[int], allows: Callable[[Ends], bool]) -> list[Ends]:
+    """The clockwise orders of some ends that are allowed, the first one first."""
+    orders: list[Ends] = [()]
+    for end in ends:
+        longer = ((*order[:gap], end, *order[gap:]) for order in orders for gap in range(min(1, len(order)), len(order) + 1))
+        orders = [order for order in longer if allows(order)]
+    return orders
 
 
-def _can_draw_part(edges: Sequence[int], place_of: Sequence[Place], allows: Callable[[Place, Ends], bool]) -> bool:
-    """Whether the edges of one part can be drawn, one after another; where an edge cannot be, those before it are drawn in another way."""
-    nothing: dict[Place, Ends] = {}
-    return has_way(nothing, edges, lambda around, edge: _with_edge(around, edge, place_of, allows))
+def _one_place_more(
+    drawn: dict[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
+) -> Iterator[dict[Place, Ends]]:
+    """The ways to draw one more place, one that is joined to those drawn if there is any: that with the fewest ways, so that what is certain comes first."""
+    near = {place_of[end ^ 1]: None for ends in drawn.values() for end in ends if place_of[end ^ 1] not in drawn}
+    among = near or {place: None for place in orders if place not in drawn}
+    fewest: list[dict[Place, Ends]] | None = None
+    for place in sorted(among, key=lambda place: len(orders[place])):
+        ways = [more for order in orders[place] if _leaves_room(more := {**drawn, place: order}, orders, place_of)]
+        if fewest is None or len(ways) < len(fewest):
+            fewest = ways
+        if len(fewest) <= 1 or not near:
+            break
+    return iter(fewest or ())
+
+
+def _leaves_room(drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]) -> bool:
+    """Whether places are drawn so that each connected part of the others can lie in one face.
+
+    Such a part is drawn as one place, with the ends that lead to it in the order in which that face meets them.
+    """
+    part = _parts_of_rest(drawn, orders, place_of)
+    following = {end: ends[i - len(ends) + 1] for ends in drawn.values() for i, end in enumerate(ends)}
+    met: dict[Place, list[int]] = {}  # for each part, the ends in it, as one face meets them
+    left = set(following)
+    while left:
+        here = start = left.pop()
+        there: dict[Place, list[int]] = {}
+        while True:
+            other = here ^ 1
+            if other not in following:
+                there.setdefault(part[place_of[other]], []).append(other)
+                here = following[here]
+            else:
+                here = following[other]
+            if here == start:
+                break
+            left.remove(here)
+        for number, ends in there.items():
+            if number in met:
+                return False
+            met[number] = ends
+    return is_planar({**drawn, **{("rest", number): tuple(reversed(ends)) for number, ends in met.items()}})
+
+
+def _parts_of_rest(drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]) -> dict[Place, Place]:
+    """For each place that is not drawn, one that stands for the connected part that it is in."""
+    part: dict[Place, Place] = {}
+    for first in orders:
+        queue = [] if first in drawn or first in part else [first]
+        while queue:
+            place = queue.pop()
+            part[place] = first
+            queue += [q for end in orders[place][0] if (q := place_of[end ^ 1]) not in drawn and q not in part] if orders[place] else []
+    return part
 
 
 def has_way(start: State, steps: Sequence[Step], ways: Callable[[State, Step], Iterator[State]]) -> bool:
@@ -133,23 +172,3 @@ def has_way(start: State, steps: Sequence[Step], ways: Callable[[State, Step], I
                 return False
         state = following
     return True
-
-
-def _with_edge(
-    around: dict[Place, Ends], edge: int, place_of: Sequence[Place], allows: Callable[[Place, Ends], bool]
-) -> Iterator[dict[Place, Ends]]:
-    """The ways to draw one more edge into a drawing that it is joined to."""
-    p, q = place_of[2 * edge], place_of[2 * edge + 1]
-    closes = p in around and q in around
-    for begun in _with_end(around, p, 2 * edge, allows):
-        for whole in _with_end(begun, q, 2 * edge + 1, allows):
-            if not closes or len(whole) - sum(map(len, whole.values())) // 2 + _faces(whole) == 2:
-                yield whole
-
-
-def _with_end(around: dict[Place, Ends], place: Place, end: int, allows: Callable[[Place, Ends], bool]) -> Iterator[dict[Place, Ends]]:
-    ends = around.get(place, ())
-    for gap in range(max(len(ends), 1)):
-        order = (*ends[: gap + 1], end, *ends[gap + 1 :])
-        if allows(place, order):
-            yield {**around, place: order}
