@@ -15,9 +15,9 @@ topological theory also needs the kinds of the actions. `one_place` and `one_cou
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from itertools import combinations, product
+from itertools import combinations, permutations, product
 from typing import NamedTuple, TypeAlias
 
 from brute_geometry import Geometry
@@ -139,6 +139,8 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
                 continue
             headings = list(_headings(labels, places, trace.actions, stars, on)) if theory.star == "frame" else []
             if theory.star == "frame" and not headings:
+                continue
+            if "planar" in on and not _is_planar(labels, places, links, headings, theory):
                 continue
             for courses in _courses(places, links, on):
                 if headings and not any(_goes_straight(labels, places, courses, h, on) for h in headings):
@@ -547,3 +549,95 @@ def _sides_allowed(
         if "path_between_sides" in on and q in on_path[h]:
             return False
     return True
+
+
+# --- planarity: whether some orders of the edges around the places make a drawing without crossings
+
+Edge: TypeAlias = frozenset[
+    tuple[int, object]
+]  # the gateways at its ends: a place, and a slot or an arm; one where it comes back to its gateway
+
+
+def _is_planar(labels: Labels, places: tuple[int, ...], links: frozenset[Link], headings: list[tuple[int, ...]], theory: Theory) -> bool:
+    """Whether the edges that travels lead along can be drawn. By headings where places have frames; if not, by sides."""
+    travels = {(s, t) for s, action, t in links if action.kind == "travel"}
+    if theory.star == "frame":
+        for heading in headings:
+            facing = dict(zip(labels, heading, strict=True))
+            edges = {frozenset({(places[s], facing[s]), (places[t], (facing[t] + 2) % 4)}) for s, t in travels}
+            if _is_drawing(edges, dict.fromkeys(places, SLOTS)):
+                return True
+        return False
+    supported = _supported(frozenset(link for link in links if link[1].kind == "travel" or places[link[0]] == places[link[2]]))
+    arms = {(s, side): (s, side) for s in supported for side in (1, -1)}
+
+    def merge(one: tuple[int, int], other: tuple[int, int]) -> None:
+        """Say that two arms are one, and so those opposite to them."""
+        for turned in (1, -1):
+            old, new = arms[one[0], turned * one[1]], arms[other[0], turned * other[1]]
+            arms.update({arm: new for arm, of in arms.items() if of == old})
+
+    for s, action, t in links:
+        if action.turn == "around" and s in supported and places[s] == places[t]:
+            merge((s, 1), (t, -1))
+    beyond = [pair for s, t in travels for pair in (((s, 1), (t, -1)), ((t, -1), (s, 1)))]
+    for _ in arms:  # gateways to which one gateway leads are one, again and again
+        for (one, other), (here, there) in product(beyond, repeat=2):
+            if arms[one] == arms[here]:
+                if places[other[0]] != places[there[0]]:
+                    return False
+                merge(other, there)
+    edges = {frozenset({(places[s], arms[s, 1]), (places[t], arms[t, -1])}) for s, t in travels}
+    rounds: list[set[tuple[object, ...]]] = []
+    for p in sorted(set(places)):
+        told: list[list[tuple[int, int]]] = []  # arms one after another, clockwise
+        for s, action, t in links:
+            if action.turn in ("right", "left") and places[s] == places[t] == p and {s, t} <= supported:
+                right, left = ((t, 1), (t, -1)) if action.turn == "right" else ((t, -1), (t, 1))
+                ends = [(s, 1), right, (s, -1), left]
+                told.append([arms[end] for end in ends if theory.symmetric_sides or end != (t, -1)])
+        here = sorted({arms[s, side] for s in supported if places[s] == p for side in (1, -1)})
+        used = {arm for edge in edges for q, arm in edge if q == p}
+        good = [order for order in permutations(here) if order[:1] == tuple(here[:1]) and all(_clockwise(order, ends) for ends in told)]
+        rounds.append({tuple(arm for arm in order if arm in used) for order in good})
+    return any(_is_drawing(edges, dict(zip(sorted(set(places)), choice, strict=True))) for choice in product(*rounds))
+
+
+def _clockwise(order: tuple[object, ...], ends: list[tuple[int, int]]) -> bool:
+    """Whether these arms, which have to be different ones, come one after another going round once."""
+    start = order.index(ends[0])
+    turned = [(order.index(end) - start) % len(order) for end in ends]
+    return len(set(turned)) == len(ends) and turned == sorted(turned)
+
+
+def _is_drawing(edges: set[Edge], rounds: dict[int, tuple[object, ...]]) -> bool:
+    """Whether each gateway has one edge, and V - E + F = 2 for each connected part.
+
+    rounds  the gateways around each place, clockwise
+    """
+    numbered = [sorted(edge, key=repr) for edge in edges]
+    ends = {(i, k): edge[k % len(edge)] for i, edge in enumerate(numbered) for k in (0, 1)}
+    if any(edges_there > 1 for edges_there in Counter(gateway for edge in edges for gateway in edge).values()):
+        return False
+    places = {p for p, _ in ends.values()}
+    after: dict[tuple[int, int], tuple[int, int]] = {}
+    for p in places:
+        around = [end for g in rounds[p] for end in ends if ends[end] == (p, g)]
+        after.update(zip(around, around[1:] + around[:1], strict=True))
+    assert set(after) == set(ends)
+    faces = _orbits({end: after[end[0], 1 - end[1]] for end in ends})
+    part = {p: p for p in places}
+    for i in range(len(numbered)):
+        one, other = part[ends[i, 0][0]], part[ends[i, 1][0]]
+        part = {p: other if q == one else q for p, q in part.items()}
+    return len(places) - len(numbered) + faces == 2 * len(set(part.values()))
+
+
+def _orbits(following: dict[tuple[int, int], tuple[int, int]]) -> int:
+    orbits = set()
+    for end in following:
+        orbit = [end]
+        while following[orbit[-1]] != end:
+            orbit.append(following[orbit[-1]])
+        orbits.add(frozenset(orbit))
+    return len(orbits)

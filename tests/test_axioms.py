@@ -51,6 +51,7 @@ CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
     "one_heading": (FRAME, "c R c", "ahead left", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "turn_rotates": (FRAME, "b L a", "ahead back", (NONE, 0), ((2, 1, 0), 1)),
     "one_dstate_per_heading": (FRAME, "a R b L c", "ahead left ahead", (NONE, 0), ((3, 1, 0), 1)),
+    "planar": (PLAIN.replace(planar=True), "a T a T a A a T a", "", ((5, 3, 1), 1), ((5, 3, 1), 2)),
     "asserted": (PLAIN.replace(different=[(0, 2)]), "a R a R a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "gateway_frame": (
         GATEWAYS,
@@ -110,5 +111,6 @@ def test_an_axiom_has_a_sentence_and_a_source(axiom: Any) -> None:
 def test_every_violation_in_the_encodings_belongs_to_an_axiom(level: str) -> None:
     text = (encodings.folder() / f"{level}.lp").read_text()
     names = {axiom.name for axiom in encodings.axioms() if axiom.level == level}
-    assert set(re.findall(r"violation\((\w+),t\) :-", text)) - {"N"} == names
+    found_of_maps = {"planar"}  # what evidence refuses once there is a map has no rule
+    assert set(re.findall(r"violation\((\w+),t\) :-", text)) - {"N"} == names - found_of_maps
     assert set(re.findall(r"% @axiom\((\w+)\)", text)) == names

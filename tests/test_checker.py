@@ -122,6 +122,8 @@ SPUN = replace(seen("a R a"), steps=tuple(replace(s, displacement=(0, 0, -1.5) i
 BROKEN = {
     "one_pose": case(TOPOLOGICAL, SPUN, "0 0", "0"),
     "asserted": case(TOPOLOGICAL.replace(different=[(0, 2)]), seen("a R a R a"), "0 0 0", "0"),
+    # After turning back, past the place before.
+    "planar": case(TOPOLOGICAL.replace(planar=True), seen("a T b T c A d T e"), "0 1 2 3 4", "0:0+ 1:0+ 2:0+ 2:0- 0:0-", "012"),
     "functional_view": case(TOPOLOGICAL, seen("a R b"), "0 0", "0"),
     "deterministic": case(TOPOLOGICAL, seen("a R b R a R c"), "0 1 0 2", "0 0 0"),
     "one_place": case(TOPOLOGICAL, seen("a"), "0", "."),
@@ -368,6 +370,7 @@ THEORIES = st.builds(
     path_order=st.sampled_from(["partial", "total"]),
     next_place=st.booleans(),
     all_on_paths=st.booleans(),
+    planar=st.booleans(),
     without=st.lists(st.sampled_from(AXIOM_NAMES), unique=True, max_size=4).map(tuple),
 )
 GROUNDS = [*CORRECT.values(), *BROKEN.values()]

@@ -409,7 +409,10 @@ def forbidden_places(equalities: Sequence[Sequence[tuple[int, int, int]]]) -> st
 
 def forbidden_equalities(equalities: Iterable[Equality]) -> str:
     """The rule that these equalities of steps do not all hold."""
-    atoms = [f"same{'' if e.of == 'dstate' else '_place'}({min(e.first, e.second)},{max(e.first, e.second)})" for e in equalities]
+    atoms = [
+        f"{'' if e.holds else 'not '}same{'' if e.of == 'dstate' else '_place'}({min(e.first, e.second)},{max(e.first, e.second)})"
+        for e in equalities
+    ]
     return f":- {', '.join(atoms)}."
 
 

@@ -10,6 +10,7 @@ from ssh_abduction.explain import Explanation
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.solver.sharing import Backbone, stretches
+from ssh_abduction.theory.evidence import evidence_of
 from ssh_abduction.trace import Trace
 
 # So many pairs of steps are told of, at most, as more cannot be taken in on a terminal.
@@ -20,6 +21,9 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
     """How a search ended, on one line. `count` is how many maps it found, of which the solution need not hold any."""
     if explanation:
         return f"{solution.status.value}: {explanation}"
+    if solution.status is Status.UNSATISFIABLE and not solution.stopped:
+        kinds = ", ".join(evidence.name for evidence in evidence_of(solution.theory))
+        return f"unsatisfiable: no map satisfies the axioms: those that clingo found are refused as wholes, by evidence ({kinds})"
     if solution.status is Status.UNSATISFIABLE:
         return f"unsatisfiable: no map satisfies the axioms; why was not found out in time ({solution.stopped})"
     why = f" ({solution.stopped})" if solution.stopped else ""

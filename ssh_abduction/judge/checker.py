@@ -27,6 +27,7 @@ from typing import TypeAlias
 
 from ssh_abduction.errors import MapError, brief
 from ssh_abduction.judge.gateways import Clash, Sight, clashes, headings
+from ssh_abduction.judge.planarity import Edges
 from ssh_abduction.maps import DState, SSHMap
 from ssh_abduction.star import Openings, Star
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -844,6 +845,41 @@ def _gateways(name: str, m: _Reading) -> Found:
             )
 
 
+# Planarity
+
+
+def _planar(m: _Reading) -> Found:
+    """Paths meet at places only: the map can be drawn in the plane, with turns right to the right, without a crossing."""
+    place_of = {s.id: s.place for s in m.states.values() if s.place is not None}
+    headings = {s: heading for s in place_of if (heading := _heading(m.states[s])) is not None}
+    turns = [(t.source.id, t.action.turn, t.target.id) for t in m.turns if t.action.turn and {t.source.id, t.target.id} <= place_of.keys()]
+    stars = {s: [star for state, star, _ in _stars(m) if state.id == s] for s in place_of} if "star_frame" in m.axioms else {}
+
+    def cross(travels: Sequence[_Move]) -> bool:
+        edges = Edges([(t.source.id, t.target.id) for t in travels], turns, place_of)
+        if m.theory.star != "frame":
+            return not edges.can_be_drawn(crossing=m.theory.symmetric_sides)
+        if headings.keys() == place_of.keys() and edges.can_be_drawn_by(headings):
+            return False
+        turned, distinct = {"turn_rotates", "one_heading"} <= m.axioms, "one_dstate_per_heading" in m.axioms
+        return not edges.can_be_drawn_in_frames(stars, turned=turned, distinct=distinct)
+
+    kept = [t for t in m.travels if {t.source.id, t.target.id} <= place_of.keys()]
+    if not cross(kept):
+        return
+    for t in list(kept):
+        if cross(fewer := [other for other in kept if other is not t]):
+            kept = fewer
+    ways = ", ".join(f"{t.source.place} to {t.target.place} (step {t.step})" for t in kept)
+    yield (
+        [step for t in kept for step in t.steps],
+        f"However it is drawn, paths cross where there is no place; travels lead along them from place {ways}.",
+    )
+
+
+# What somebody says
+
+
 def _asserted(m: _Reading) -> Found:
     """What somebody asserts of pairs of steps holds in the map."""
     labels, theory = m.map.labels, m.theory
@@ -909,4 +945,5 @@ AXIOMS: dict[str, Check] = {
     "gateway_path": partial(_gateways, "gateway_path"),
     "asserted": _asserted,
     "one_pose": _one_pose,
+    "planar": _planar,
 }

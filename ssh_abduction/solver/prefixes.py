@@ -84,7 +84,8 @@ class Prefixes:
 
     def _forbid(self, equalities: frozenset[Equality]) -> None:
         """Let no map have all of these equalities; where the engine cannot be told, another one goes on that can."""
-        if self.engine.forbid(equalities):
+        can_be_told = isinstance(self.engine, StepEngine) or all(equality.holds for equality in equalities)
+        if can_be_told and self.engine.forbid(equalities):
             return
         self.engine.settle()
         size, theory = self.engine.size, self._task.theory

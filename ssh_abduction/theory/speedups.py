@@ -171,12 +171,13 @@ SURVIVE_A_CUT = FRAMES | {
     "side_of_branch, excusable",
     "sides_disjoint",
     "path_between_sides",
+    "planar",
     "asserted",
     "asserted same",
     "one_pose",
 }
 # Kinds of evidence that say nothing but which steps are not one dstate, or not at one place, and which labels go not together.
-PAIRS_OF_STEPS = ("asserted", "one_pose")
+PAIRS_OF_STEPS = ("asserted", "one_pose", "planar")
 
 TABLE = (
     Speedup(

@@ -47,6 +47,7 @@ SPOKEN_FOR = {
     "symmetric_sides",
     "next_place",
     "all_on_paths",
+    "planar",
     "prefer",
     "without",
     "rules",
@@ -76,6 +77,7 @@ class Theory:
     reject           the probability, at most, that displacements refuse a true map of the trace
     joint            so many returns are tested together, at most: 1 or 2
     returns          how many returns of the trace may be true, among which `reject` is shared; 0 counts them in the trace
+    planar           paths meet at places only: the map can be drawn in the plane, with turns right to the right, without a crossing
     prefer           what is minimised, first to last: dstates, paths, places, and with boundary=defeasible excuses, which go first
                      unless they are named; what is not named is not minimised. auto is dstates,places,paths where displacements are used,
                      else dstates,paths,places
@@ -100,6 +102,7 @@ class Theory:
     prefer: tuple[Count, ...] = AUTO
     without: tuple[str, ...] = ()
     rules: tuple[Rules, ...] = ()
+    planar: bool = False
     same: tuple[Pair, ...] = ()
     different: tuple[Pair, ...] = ()
     elsewhere: tuple[Pair, ...] = ()
