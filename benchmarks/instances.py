@@ -7,8 +7,9 @@
 
 from __future__ import annotations
 
+import math
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ssh_abduction import Trace
 
@@ -75,6 +76,32 @@ def maze(width: int, height: int, *, steps: int, seed: int, loops: float = 0.1, 
         done.append(action)
     views = ["".join(map(str, openings)) for openings in seen]
     return Walk(Trace.from_steps(views, done, stars=seen if stars else None, name=f"maze {width} x {height}, seed {seed}"), tuple(truth))
+
+
+def driven(walk: Walk, seed: int, *, cell: float = 10.0, along: float = 0.05, across: float = 0.005, heading: float = 0.002) -> Walk:
+    """A walk with the displacements that a robot's odometry reports of it, and what the trace says of its noise: `along` and `heading`, and else the defaults.
+
+    cell            how far a travel leads, in metres
+    along, across   standard deviation of a travel, along it and across, as a share of its length
+    heading         standard deviation of the heading, in radians a metre
+    """
+    chance = random.Random(seed)
+    turned = {"right": -math.pi / 2, "left": math.pi / 2, "around": math.pi}
+    displacements = []
+    for action in walk.trace.actions:
+        way = cell if action.kind == "travel" else 0.0
+        x, y = chance.gauss(way, along * way), chance.gauss(0.0, across * way)
+        displacements.append((x, y, turned.get(action.name, 0.0) + chance.gauss(0.0, heading * way)))
+    trace = walk.trace
+    moved = Trace.from_steps(
+        [step.view or "" for step in trace],
+        trace.actions,
+        stars=[step.star for step in trace] if trace.has_stars else None,
+        displacements=displacements,
+        odometry={"along": along, "heading": heading},
+        name=trace.name,
+    )
+    return replace(walk, trace=moved)
 
 
 def moore(states: int, views: int, *, steps: int, seed: int, actions: int = 2) -> Walk:

@@ -135,7 +135,7 @@ class _Filter:
 
     def closing(self, first: Any, last: Any) -> Array:
         """How far off loops close, m x 3."""
-        off = self.pose[last] - self.pose[first]
+        off: Array = self.pose[last] - self.pose[first]
         off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
         return off
 
