@@ -9,12 +9,19 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
-from ssh_abduction import Trace
+import numpy as np
+
+from simulator.motion import Pose, between, reported
+from ssh_abduction import Odometry, Trace
 
 HEADINGS = ((0, 1), (1, 0), (0, -1), (-1, 0))  # north, east, south, west
 TURNS = {"right": 1, "around": 2, "left": 3}
+# Metres that the cells of a maze are apart.
+CELL = 10.0
 
 
 @dataclass(frozen=True)
@@ -25,12 +32,37 @@ class Walk:
     truth: tuple[object, ...]
 
 
-def maze(width: int, height: int, *, steps: int, seed: int, loops: float = 0.1, stars: bool = False, follow: bool = False) -> Walk:
+def displaced(trace: Trace, poses: Sequence[Pose], odometry: Odometry, seed: int, *, scale: float = 0.0, bend: float = 0.0) -> Trace:
+    """A trace with the displacements between the true poses of its steps, as an odometry reports them; see simulator.motion.reported."""
+    rng = np.random.default_rng(seed)
+    moved = [reported(between(a, b), odometry, rng, scale=scale, bend=bend) for a, b in pairwise(poses)]
+    steps = (replace(step, displacement=displacement) for step, displacement in zip(trace.steps, [None, *moved], strict=True))
+    return replace(trace, steps=tuple(steps), odometry=odometry)
+
+
+def maze(
+    width: int,
+    height: int,
+    *,
+    steps: int,
+    seed: int,
+    loops: float = 0.1,
+    stars: bool = False,
+    follow: bool = False,
+    odometry: Odometry | None = None,
+    cell: float = CELL,
+    scale: float = 0.0,
+    bend: float = 0.0,
+) -> Walk:
     """A random walk of so many actions in a maze of corridors: a random spanning tree of the grid, and each further wall open by chance.
 
     A state is a cell and a heading, a view the openings ahead, right, back and left. Where the way ahead is open the robot
     travels half of the time; else it turns. It turns around only where it cannot travel. One that follows corridors travels in four of six cases
     where it can; else it turns to where the way is open to its right or left, and around only in a dead end.
+
+    odometry     if given, the trace has displacements with this noise; the walk is the same
+    cell         metres from one cell to the next
+    scale, bend  errors of the odometry that repeat, as a share and in radians a metre
     """
     chance = random.Random(seed)
     walls = [((x, y), (x + dx, y + dy)) for x in range(width) for y in range(height) for dx, dy in ((1, 0), (0, 1))]
@@ -56,10 +88,12 @@ def maze(width: int, height: int, *, steps: int, seed: int, loops: float = 0.1, 
     heading = chance.randrange(4)
     seen: list[list[int]] = []
     truth: list[object] = []
+    poses: list[Pose] = []
     done: list[str] = []
     for step in range(steps + 1):
         seen.append([int(((x, y), ahead(x, y, heading + k)) in doors) for k in range(4)])
         truth.append((x, y, heading))
+        poses.append((cell * x, cell * y, math.pi / 2 * (1 - heading)))
         if step == steps:
             break
         ahead_open, right_open, _, left_open = seen[-1]
@@ -75,33 +109,10 @@ def maze(width: int, height: int, *, steps: int, seed: int, loops: float = 0.1, 
             heading = (heading + TURNS[action]) % 4
         done.append(action)
     views = ["".join(map(str, openings)) for openings in seen]
-    return Walk(Trace.from_steps(views, done, stars=seen if stars else None, name=f"maze {width} x {height}, seed {seed}"), tuple(truth))
-
-
-def driven(walk: Walk, seed: int, *, cell: float = 10.0, along: float = 0.05, across: float = 0.005, heading: float = 0.002) -> Walk:
-    """A walk with the displacements that a robot's odometry reports of it, and what the trace says of its noise: `along` and `heading`, and else the defaults.
-
-    cell            how far a travel leads, in metres
-    along, across   standard deviation of a travel, along it and across, as a share of its length
-    heading         standard deviation of the heading, in radians a metre
-    """
-    chance = random.Random(seed)
-    turned = {"right": -math.pi / 2, "left": math.pi / 2, "around": math.pi}
-    displacements = []
-    for action in walk.trace.actions:
-        way = cell if action.kind == "travel" else 0.0
-        x, y = chance.gauss(way, along * way), chance.gauss(0.0, across * way)
-        displacements.append((x, y, turned.get(action.name, 0.0) + chance.gauss(0.0, heading * way)))
-    trace = walk.trace
-    moved = Trace.from_steps(
-        [step.view or "" for step in trace],
-        trace.actions,
-        stars=[step.star for step in trace] if trace.has_stars else None,
-        displacements=displacements,
-        odometry={"along": along, "heading": heading},
-        name=trace.name,
-    )
-    return replace(walk, trace=moved)
+    trace = Trace.from_steps(views, done, stars=seen if stars else None, name=f"maze {width} x {height}, seed {seed}")
+    if odometry is not None:
+        trace = displaced(trace, poses, odometry, seed, scale=scale, bend=bend)
+    return Walk(trace, tuple(truth))
 
 
 def moore(states: int, views: int, *, steps: int, seed: int, actions: int = 2) -> Walk:

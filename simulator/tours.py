@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from simulator.control import STILL, Driver, Tolerance, act, climb
 from simulator.errors import SimulatorError
 from simulator.laser import Laser
-from simulator.robot import Body, Robot
+from simulator.motion import DIGITS
+from simulator.robot import Body, Report, Robot
 from simulator.world import World
+from ssh_abduction.odometry import Displacement, Odometry
 from ssh_abduction.trace import Action, Step, Trace
 
 Array = NDArray[np.float64]
@@ -63,7 +65,8 @@ def simulate(
 
     stars   also log the openings at each place, as the robot saw them since it came there
     every   log an image each so many metres of odometry instead, wherever the robot is; the trace then has travels only
-    The truth goes into `truth`: dstate, place, path and pose. Nothing but evaluation may read it.
+    Each step has as its displacement what the robot's odometry says of all motions since the last step, those of hill-climbing included;
+    the trace's odometry is the noise that fits them. The truth goes into `truth`: dstate, place, path and pose. Nothing but evaluation may read it.
     Raises SimulatorError where the route cannot be driven.
     """
     if tours < 1:
@@ -78,14 +81,63 @@ def simulate(
         raise SimulatorError(f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, {y}); move it")
     rng = np.random.default_rng(seed)
     robot = Robot(body, world.start, rng)
-    driver = Driver(world.arranged(rng), robot, laser or Laser(), rng, tolerance or Tolerance())
-    logged = _evenly(driver, world, tours, every) if every is not None else _at_dstates(driver, world, tours, stars)
-    steps = list(logged)
-    steps[-1] = Step(image=steps[-1].image, star=steps[-1].star, truth=steps[-1].truth)
-    return Trace(tuple(steps), name=f"{world.name}, {tours} tours, seed {seed}")
+    tolerance = tolerance or Tolerance()
+    driver = Driver(world.arranged(rng), robot, laser or Laser(), rng, tolerance)
+    log = Log(robot)
+    steps = list(_at_dstates(driver, log, world, tours, stars)) if every is None else _evenly(driver, log, world, tours, every)
+    steps[-1] = replace(steps[-1], action=None)
+    odometry = noise_model(log.reports, body, tolerance if every is None else None)
+    return Trace(tuple(steps), name=f"{world.name}, {tours} tours, seed {seed}", odometry=odometry)
 
 
-def _at_dstates(driver: Driver, world: World, tours: int, stars: bool) -> Iterator[Step]:
+@dataclass
+class Log:
+    """What the odometry of a robot reports between the steps that are logged."""
+
+    robot: Robot
+    reports: list[Report] = field(default_factory=list)
+    begun: bool = False
+
+    def displacement(self) -> Displacement | None:
+        """The displacement from the last step, rounded as logs are; None for the first step."""
+        report = self.robot.report()
+        if not self.begun:
+            self.begun = True
+            return None
+        self.reports.append(report)
+        dx, dy, turned = (round(v, DIGITS) for v in report.displacement)
+        return dx, dy, turned
+
+
+def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | None = None) -> Odometry:
+    """The noise of the displacements between dstates, from that of the robot's wheels and from the tolerance of hill-climbing.
+
+    Each motion that the wheels report errs by a share of itself, so that of many motions together a smaller share is wrong. The shares of a
+    step are those by which the reports have, on the average, the covariance that they have.
+
+    A map speaks of fixed points, and hill-climbing ends off them at both ends of a step: evenly spread, as this model has it, within its
+    tolerance. A heading that is off where a step begins also puts the end of the step aside. Without a tolerance the displacements are
+    those between the poses themselves.
+    """
+    ways = math.fsum(math.hypot(*r.displacement[:2]) ** 2 for r in reports)
+    turns = math.fsum(r.displacement[2] ** 2 for r in reports)
+    along, across, heading = np.sum([np.diag(r.covariance) for r in reports], axis=0) if reports else np.zeros(3)
+    share = 1 / ways if ways else 0.0
+    offset, tilt = (tolerance.close / math.sqrt(3), tolerance.straight / math.sqrt(3)) if tolerance else (0.0, 0.0)
+    errors = {
+        "along": math.sqrt(along * share),
+        "across": math.sqrt(across * share + tilt**2),
+        "heading": math.sqrt(max(heading - body.odometry**2 * turns, 0.0) * share),
+        "turning": body.odometry,
+        "position": math.sqrt(2) * offset,
+        "angle": math.sqrt(2) * tilt,
+        "scale": abs(body.scale),
+        "bend": abs(body.bend),
+    }
+    return Odometry.of({name: round(error, 6) for name, error in errors.items()})
+
+
+def _at_dstates(driver: Driver, log: Log, world: World, tours: int, stars: bool) -> Iterator[Step]:
     star = Star(world.reach)
     climb(driver)
     if stars:  # look behind, as the half circle does not show it
@@ -105,27 +157,29 @@ def _at_dstates(driver: Driver, world: World, tours: int, stars: bool) -> Iterat
                 image=_metres(image),
                 action=Action.of(action),
                 star=star.seen() if stars else None,
+                displacement=log.displacement(),
                 truth=_truth(world, driver.robot.pose),
             )
             act(driver, action)
             star.act(action)
 
 
-def _evenly(driver: Driver, world: World, tours: int, every: float) -> Iterator[Step]:
+def _evenly(driver: Driver, log: Log, world: World, tours: int, every: float) -> list[Step]:
     """Images each `every` metres of odometry. What is at most that far along the route counts as one spot, tour after tour."""
     logged: list[Step] = []
     leg_began = due = 0.0
     leg = 0
 
-    def log(driver: Driver) -> None:
+    def look(driver: Driver) -> None:
         nonlocal due
         if driver.robot.driven >= due:
             spot = f"leg {leg % len(world.route)}, {round((driver.robot.driven - leg_began) / every)}"
             truth = {"dstate": spot, "pose": [round(v, 4) for v in driver.robot.pose]}
-            logged.append(Step(image=_metres(driver.look(STILL)), action=Action.of("travel"), truth=truth))
+            image = _metres(driver.look(STILL))
+            logged.append(Step(image=image, action=Action.of("travel"), displacement=log.displacement(), truth=truth))
             due += every
 
-    driver.on_travel = log
+    driver.on_travel = look
     climb(driver)
     for tour in range(tours):
         if tour:
@@ -134,7 +188,7 @@ def _evenly(driver: Driver, world: World, tours: int, every: float) -> Iterator[
             leg_began = driver.robot.driven
             act(driver, action)
             leg += 1
-    yield from logged
+    return logged
 
 
 def _metres(image: Array) -> tuple[float, ...]:

@@ -13,9 +13,10 @@ if TYPE_CHECKING:
     from ssh_abduction.engines.base import Cost
     from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
-    from ssh_abduction.maps import DState, Path, SSHMap
+    from ssh_abduction.maps import DState, Fit, Path, Pose, SSHMap
     from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
+    from ssh_abduction.rungs import Rung, ladder
     from ssh_abduction.solver.result import Bound, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
     from ssh_abduction.steps.certificate import Certificate
@@ -27,9 +28,10 @@ _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
     "errors": ("MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
-    "maps": ("DState", "Path", "SSHMap"),
+    "maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
     "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
+    "rungs": ("Rung", "ladder"),
     "solver.result": ("Bound", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
     "steps.certificate": ("Certificate",),
@@ -45,12 +47,15 @@ __all__ = [
     "Cost",
     "DState",
     "Evaluation",
+    "Fit",
     "MapError",
     "MapEvaluation",
     "Odometry",
     "OnlineMapper",
     "Path",
+    "Pose",
     "Progress",
+    "Rung",
     "SSHError",
     "SSHMap",
     "Search",
@@ -64,6 +69,7 @@ __all__ = [
     "Trace",
     "TraceError",
     "evaluate",
+    "ladder",
     "solve",
 ]
 

@@ -7,6 +7,7 @@ them is found by moving it a little, and the covariance of several closings is J
 from __future__ import annotations
 
 import math
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -50,6 +51,7 @@ class Geometry:
             heading = start + turned + 2 * half + wrong[2]
         return np.array([x, y, heading])
 
+    @cache  # noqa: B019 - it is as short-lived as the test
     def derivatives(self, i: int, j: int, bend: float) -> np.ndarray:
         size = 3 * len(self.trace) + 2
         rows = []
@@ -59,6 +61,7 @@ class Geometry:
             rows.append((self.end(i, j, bend, errors) - self.end(i, j, bend, -errors)) / (2 * LITTLE))
         return np.array(rows).T
 
+    @cache  # noqa: B019
     def noise(self) -> np.ndarray:
         size = 3 * len(self.trace) + 2
         noise = np.zeros((size, size))
@@ -68,6 +71,7 @@ class Geometry:
         noise[-2, -2], noise[-1, -1] = self.odometry.scale**2, self.drift**2
         return noise
 
+    @cache  # noqa: B019
     def loop(self, i: int, j: int, bend: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
         """How far off a loop closes, its derivatives, what is added to its covariance, and whether anything is known of it."""
         off = self.end(i, j, bend, np.zeros(3 * len(self.trace) + 2)) - self.end(i, i, bend, np.zeros(3 * len(self.trace) + 2))

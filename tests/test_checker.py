@@ -117,7 +117,9 @@ CORRECT = {
     "one step": case(TOPOLOGICAL, seen("a"), "0", "0"),
 }
 
+SPUN = replace(seen("a R a"), steps=tuple(replace(s, displacement=(0, 0, -1.5) if t else None) for t, s in enumerate(seen("a R a"))))
 BROKEN = {
+    "one_pose": case(TOPOLOGICAL, SPUN, "0 0", "0"),
     "asserted": case(TOPOLOGICAL.replace(different=[(0, 2)]), seen("a R a R a"), "0 0 0", "0"),
     "functional_view": case(TOPOLOGICAL, seen("a R b"), "0 0", "0"),
     "deterministic": case(TOPOLOGICAL, seen("a R b R a R c"), "0 1 0 2", "0 0 0"),

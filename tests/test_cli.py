@@ -79,6 +79,7 @@ def test_every_field_of_a_theory_is_a_flag(capsys: pytest.CaptureFixture[str]) -
     flags = [
         *("--theory", "circumscriptive", "--boundary", "defeasible", "--no-symmetric-sides", "--path-order", "partial", "--next-place"),
         *("--no-all-on-paths", "--star", "pattern", "--prefer", "places,excuses", "--without", "on_path", "--level", "topological"),
+        *("--displacement", "none", "--reject", "0.01", "--joint", "1"),
     ]
     assert main(["solve", ACES, "-n", "1", "--json", *flags]) == 0
     expected = Theory(
@@ -89,6 +90,9 @@ def test_every_field_of_a_theory_is_a_flag(capsys: pytest.CaptureFixture[str]) -
         star="pattern",
         prefer=("places", "excuses"),
         without=("on_path",),
+        displacement="none",
+        reject=0.01,
+        joint=1,
     )
     assert Theory.from_dict(json.loads(capsys.readouterr().out)["theory"]) == expected
 

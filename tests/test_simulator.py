@@ -16,11 +16,12 @@ from hypothesis import strategies as st
 from simulator.control import Driver, act, climb
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS, Laser
+from simulator.motion import between, moved, reported
 from simulator.robot import Body, Robot
 from simulator.sight import LONG, sight
-from simulator.tours import simulate
+from simulator.tours import noise_model, simulate
 from simulator.world import World
-from ssh_abduction import Trace
+from ssh_abduction import Odometry, Trace
 
 RECTANGLE = World.named("notched-rectangle")
 HALL = World.named("taylor-hall")
@@ -304,6 +305,143 @@ def test_odometry_drifts_and_is_not_the_truth(circuits: Trace) -> None:
     for _ in range(200):
         robot.move(0.1, 0.05)
     assert math.dist(robot.pose[:2], robot.odometry[:2]) > 0.001
+
+
+# Odometry
+
+POSES = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3, 3))
+SQUARE = 2 * ([(0.15, 0.01)] * 20 + [(0.0, -math.pi / 2)])  # two sides of a square, in strides and turns
+
+
+def whitened(error: Any, covariance: Any) -> np.ndarray:
+    """An error, (3,), in standard deviations: three independent numbers."""
+    error = np.array([error[0], error[1], math.remainder(error[2], math.tau)])
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(np.array(covariance)), error))
+
+
+def errors_of(trace: Trace, poses: list[tuple[float, float, float]], odometry: Odometry, kind: str) -> np.ndarray:
+    """The errors of the displacements of the actions of a kind, against those between poses, in standard deviations: (n, 3)."""
+    found = []
+    for before, after, step, action in zip(poses, poses[1:], trace.steps[1:], trace.actions, strict=False):
+        assert step.displacement is not None
+        if action.kind == kind:
+            found.append(whitened(np.subtract(step.displacement, between(before, after)), odometry.covariance(step.displacement)))
+    return np.array(found)
+
+
+def fixed_points(trace: Trace) -> list[tuple[float, float, float]]:
+    """For each step the middle of all poses at its place, and of all headings at its dstate."""
+    places: dict[str, list[list[float]]] = {}
+    for step in trace.steps:
+        places.setdefault(step.truth["place"], []).append(step.truth["pose"][:2])
+    middle = {place: np.mean(found, 0) for place, found in places.items()}
+    heading = {name: math.atan2(np.sin(p[:, 2]).mean(), np.cos(p[:, 2]).mean()) for name, p in poses_by_dstate(trace).items()}
+    return [(*map(float, middle[step.truth["place"]]), heading[step.truth["dstate"]]) for step in trace.steps]
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(POSES, POSES)
+def test_a_displacement_leads_from_one_pose_to_the_other(start: tuple[float, float, float], end: tuple[float, float, float]) -> None:
+    x, y, heading = moved(start, between(start, end))
+    assert (x, y) == pytest.approx(end[:2], abs=1e-9)
+    assert math.remainder(heading - end[2], math.tau) == pytest.approx(0, abs=1e-9)
+
+
+def test_noise_has_the_covariance_that_the_odometry_says() -> None:
+    rng, displacement, odometry = np.random.default_rng(0), (6.0, -8.0, 0.5), Odometry(along=0.05, across=0.01, heading=0.01)
+    told = np.array([reported(displacement, odometry, rng) for _ in range(4000)])
+    np.testing.assert_allclose(told.mean(0), displacement, atol=0.03)
+    np.testing.assert_allclose(np.cov(told.T), odometry.covariance(displacement), atol=0.015)
+
+
+def test_errors_that_repeat_make_a_line_an_arc() -> None:
+    """In pieces or at once: after ten metres straight ahead, 10 % too long, the heading that is reported is off by 10 bends."""
+    exact, rng = Odometry(0, 0, 0, 0, 0, 0, 0, 0), np.random.default_rng(0)
+    pose = (0.0, 0.0, 0.0)
+    for _ in range(100):
+        pose = moved(pose, reported((0.1, 0.0, 0.0), exact, rng, scale=0.1, bend=0.02))
+    at_once = reported((10.0, 0.0, 0.0), exact, rng, scale=0.1, bend=0.02)
+    arc = (11.0 * math.sin(0.2) / 0.2, 11.0 * (1 - math.cos(0.2)) / 0.2, 0.2)
+    np.testing.assert_allclose(pose, arc, atol=0.1)
+    np.testing.assert_allclose(at_once, arc, atol=0.1)
+
+
+def test_the_covariance_of_a_report_is_that_of_its_errors() -> None:
+    rng = np.random.default_rng(0)
+    errors = []
+    for _ in range(600):
+        robot = Robot(Body(), (1.0, 2.0, 0.7), rng)
+        robot.move(0.3, 0.2)
+        robot.report()
+        start = robot.pose
+        for motion in SQUARE:
+            robot.move(*motion)
+        said = robot.report()
+        errors.append(whitened(np.subtract(said.displacement, between(start, robot.pose)), said.covariance))
+    found = np.array(errors)
+    np.testing.assert_allclose(found.mean(0), 0, atol=0.15)
+    np.testing.assert_allclose(np.cov(found.T), np.eye(3), atol=0.2)
+
+
+def test_worn_wheels_report_too_long_ways_and_unequal_ones_a_drift() -> None:
+    robot = Robot(Body(slip=0, wander=0, odometry=0, scale=0.1, bend=0.02), (0.0, 0.0, 0.0), np.random.default_rng(0))
+    for _ in range(50):
+        robot.move(0.2, 0.0)
+    assert robot.pose == pytest.approx((10.0, 0.0, 0.0))
+    assert robot.driven == pytest.approx(11.0)
+    assert robot.report().displacement == pytest.approx((11.0 * math.sin(0.2) / 0.2, 11.0 * (1 - math.cos(0.2)) / 0.2, 0.2), abs=0.01)
+    for _ in range(50):
+        robot.move(-0.2, 0.0)
+    assert robot.odometry == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+
+
+def test_displacements_are_the_motions_between_the_dstates(circuits: Trace, tours: Trace) -> None:
+    """As the wheels have it, they lead from true pose to true pose; as a map has it, from fixed point to fixed point."""
+    for trace in (circuits, tours):
+        assert trace.steps[0].displacement is None
+        assert trace.odometry is not None
+        turns = errors_of(trace, [tuple(step.truth["pose"]) for step in trace.steps], trace.odometry, "turn")[:, 2]
+        assert abs(turns.mean()) < 0.5
+        assert 0.5 < (turns**2).mean() < 1.5
+        travels = errors_of(trace, fixed_points(trace), trace.odometry, "travel")
+        assert np.abs(travels.mean(0)).max() < 0.5
+        assert 0.15 < (travels**2).mean() < 1.2
+
+
+def test_the_shares_of_a_step_are_those_of_its_motions() -> None:
+    """Without hill-climbing, over many drives: chi-square by the model of all reports has its degrees of freedom."""
+    rng = np.random.default_rng(0)
+    body = Body(wander=0, odometry=0.05)
+    reports, errors = [], []
+    for _ in range(300):
+        robot = Robot(body, (0.0, 0.0, 0.0), rng)
+        for _ in range(60):
+            robot.move(0.15, 0.0)
+        reports.append(robot.report())
+        errors.append(np.subtract(reports[-1].displacement, robot.pose))
+    odometry = noise_model(reports, body)
+    assert odometry.along == pytest.approx(0.05 / math.sqrt(60), rel=0.05)
+    assert (odometry.position, odometry.angle, odometry.scale) == (0, 0, 0)
+    along = np.array([whitened(e, odometry.covariance(r.displacement))[0] for e, r in zip(errors, reports, strict=True)])
+    assert 0.8 < (along**2).mean() < 1.2
+
+
+def test_wrong_scale_and_steady_drift_are_in_the_trace_and_in_its_odometry() -> None:
+    plain = simulate(RECTANGLE, 5, seed=7)
+    trace = simulate(RECTANGLE, 5, seed=7, body=Body(scale=0.1, bend=0.0035))
+    assert trace.odometry is not None
+    assert (trace.odometry.scale, trace.odometry.bend) == (0.1, 0.0035)
+    assert [step.truth["dstate"] for step in trace.steps] == [step.truth["dstate"] for step in plain.steps]
+    pairs = [(a, b) for a, b, action in zip(trace.steps, trace.steps[1:], trace.actions, strict=False) if action.kind == "travel"]
+    told = sum(math.hypot(*b.displacement[:2]) for _, b in pairs if b.displacement)
+    true = sum(math.dist(a.truth["pose"][:2], b.truth["pose"][:2]) for a, b in pairs)
+    assert told / true == pytest.approx(1.1, abs=0.01)
+
+
+@pytest.mark.parametrize(("name", "value"), [("scale", 0.6), ("bend", -0.7), ("odometry", -0.1), ("scale", math.nan)])
+def test_an_odometry_that_nobody_can_drive_with(name: str, value: float) -> None:
+    with pytest.raises(SimulatorError, match=rf"body\.{name}: expected a number from .* to 0\.5.*, got .*; choose a smaller error"):
+        Body(**{name: value})
 
 
 def test_the_openings_seen_are_those_that_are_there(tours: Trace) -> None:

@@ -27,6 +27,8 @@ def add_theory(parser: argparse.ArgumentParser, default: str = "topological, or 
     for field in fields(Theory):
         if isinstance(field.default, bool):
             group.add_argument(f"--{field.name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=said.get(field.name))
+    group.add_argument("--reject", type=float, metavar="P", help=said.get("reject"))
+    group.add_argument("--joint", type=int, metavar="N", help=said.get("joint"))
     group.add_argument("--prefer", metavar="COUNTS", help=f"what to minimise, first to last, of {', '.join(COUNTS)}; commas between")
     group.add_argument("--without", metavar="AXIOMS", help="leave these axioms out; commas between")
     group.add_argument(

@@ -1,4 +1,4 @@
-"""ssh-abduction simulate WORLD: drive tours, log images and actions."""
+"""ssh-abduction simulate WORLD: drive tours, log images, actions and odometry."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ssh_abduction.errors import printable
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Drive tours through a world, and log an image and an action at each dstate. Views are left to cluster."
+    text = "Drive tours through a world, and log an image, an action and the odometry at each dstate. Views are left to cluster."
     parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
     parser.add_argument("world", help="notched-rectangle, taylor-hall, a world file (.json), or an occupancy map (.yaml)")
     parser.add_argument("--tours", type=int, default=1, metavar="N", help="how often the route is driven (default: 1)")
@@ -20,15 +20,26 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("--start", metavar="X,Y,DEGREES", help="another start than the world's; write --start=-1,2,90")
     parser.add_argument("--route", metavar="ACTIONS", help="another route than the world's; travel, right, left, around with commas")
     parser.add_argument("--reach", type=float, metavar="M", help="metres from a wall at which the robot follows it")
+    errors = parser.add_argument_group("odometry", "how wrong the displacements are that the robot logs")
+    errors.add_argument(
+        "--odometry-noise", type=float, metavar="SHARE", help="standard deviation, as a share of each motion (default: 0.02)"
+    )
+    errors.add_argument("--scale-error", type=float, default=0.0, metavar="SHARE", help="all ways are reported longer by this (default: 0)")
+    errors.add_argument("--bend-error", type=float, default=0.0, metavar="DEGREES", help="drift of the heading in each metre (default: 0)")
     add_output(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
+    import math
+
+    from simulator.robot import Body
     from simulator.tours import simulate
     from simulator.world import World
 
+    noise = Body.odometry if options.odometry_noise is None else options.odometry_noise
+    body = Body(odometry=noise, scale=options.scale_error, bend=math.radians(options.bend_error))
     world = World.named(options.world).with_choices(options.start, options.route, options.reach)
-    trace = simulate(world, options.tours, options.seed, stars=not options.no_stars, every=options.every)
+    trace = simulate(world, options.tours, options.seed, body=body, stars=not options.no_stars, every=options.every)
     write(trace, options.output, f"{counted(len(trace), 'images')} of {printable(world.name)}")
     return 0

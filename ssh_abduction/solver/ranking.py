@@ -16,6 +16,8 @@ RANKED = 1000
 DOUBTED = 1e-3
 # and the standard deviations are wrong by this factor at least: less changes no answer.
 OFF = 1.5
+# Displacements that agree to the last digit would make it 0.
+NEVER_LESS = 0.01
 
 _Key: TypeAlias = tuple[tuple[int, ...], tuple[int | None, ...]]
 
@@ -64,7 +66,7 @@ def noise_warning(fit: Fit | None) -> str | None:
     """What is wrong with the noise that the odometry claims, by how well the best map closes; None where nothing is."""
     if fit is None or fit.dof < 1 or min(fit.p, 1 - fit.p) > DOUBTED / 2:
         return None
-    factor = math.sqrt(fit.chi2 / fit.dof)
+    factor = max(math.sqrt(fit.chi2 / fit.dof), NEVER_LESS)
     if 1 / OFF < factor < OFF:
         return None
     how, told = ("smaller", "tight") if factor > 1 else ("larger", "loose")

@@ -12,12 +12,16 @@ variables (`Pairs`), so that evidence makes solving faster. What it finds out on
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ssh_abduction.theory.evidence.asserted import Asserted
 from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
-from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
+
+if TYPE_CHECKING:
+    from ssh_abduction.theory.theory import Theory
 
 KINDS: tuple[type[Evidence], ...] = (Asserted, Displacement)
 

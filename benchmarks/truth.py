@@ -1,0 +1,208 @@
+"""Are the minimal maps true? Families of traces whose truth is known, with displacements: each is solved, and a table in Markdown says what came out.
+
+    python benchmarks/truth.py --family mazes [--cells 4] [--steps 40] [--seeds 10] [--stars]
+    python benchmarks/truth.py --family plans --folder ../shared/data/plans [--steps 100]
+    python benchmarks/truth.py --family aces3 [--seeds 10] [--stars]
+    python benchmarks/truth.py --family taylor-hall [--seeds 20] [--stars]
+
+A map is true if its labels are the true dstates up to renaming, and its places the true places. Flags of the noise are the fields of Odometry: the noise that is drawn, and that the trace
+says it has; in Taylor Hall the robot has its own. `--scale-error` and `--bend-error` add errors that repeat. With `--displacement none` the solver is not told of
+displacements. Seeds begin at `--first`. A row for each trace, and the sum below.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import sys
+import time
+from collections.abc import Hashable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from instances import displaced, maze
+
+from simulator.motion import Pose
+from simulator.plans import Plan, tour
+from simulator.robot import Body
+from ssh_abduction import Odometry, Theory, Trace, solve
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.odometry import NUMBERS
+
+ROOT = Path(__file__).parent.parent
+# What the noise is unless a flag says otherwise: 5 % along the way, 0.5 % across it, and 0.002 rad of heading in a metre.
+NOISE = {"along": 0.05, "across": 0.005, "heading": 0.002, "turning": 0.0, "position": 0.0, "angle": 0.0, "scale": 0.0, "bend": 0.0}
+# The layout of the ACES3 route: three columns and three rows of places, by their x and y in metres.
+COLUMNS, ROWS = (-20.0, -1.0, 22.5), (-0.5, -19.0, -39.0)
+ACES3 = {name: (COLUMNS[i % 3], ROWS[i // 3]) for i, name in enumerate(("NW", "N", "NE", "W", "C", "E", "SW", "S", "SE"))}
+COMPASS = {"E": 0.0, "N": math.pi / 2, "W": math.pi, "S": -math.pi / 2}
+
+
+@dataclass(frozen=True)
+class Known:
+    """A trace, and for each step the true dstate and the true place."""
+
+    name: str
+    trace: Trace
+    dstates: tuple[Hashable, ...]
+    places: tuple[Hashable, ...]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise that is drawn, and the errors that repeat: a share, and radians a metre."""
+
+    odometry: Odometry
+    scale: float = 0.0
+    bend: float = 0.0
+
+
+def partition(names: Sequence[Hashable]) -> tuple[int, ...]:
+    """Names numbered by first visit: two namings of the steps are one up to renaming if these are equal."""
+    numbers: dict[Hashable, int] = {}
+    return tuple(numbers.setdefault(name, len(numbers)) for name in names)
+
+
+def is_true(ssh_map: SSHMap, known: Known) -> bool:
+    """Whether the labels of a map are the true dstates, and the places of its labels the true places, both up to renaming."""
+    places = [ssh_map.dstates[label].place for label in ssh_map.labels]
+    return partition(ssh_map.labels) == partition(known.dstates) and partition(places) == partition(known.places)
+
+
+def mazes(cells: int, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
+    for seed in seeds:
+        walk = maze(
+            cells, cells, steps=steps, seed=seed, stars=True, follow=True, odometry=noise.odometry, scale=noise.scale, bend=noise.bend
+        )
+        yield Known(
+            f"maze {cells} x {cells}, {seed}", walk.trace, walk.truth, tuple(state[:2] for state in walk.truth if isinstance(state, tuple))
+        )
+
+
+def plans(folder: Path, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
+    for path in sorted(folder.glob("*.xml"), key=lambda path: path.stem.lower()):
+        plan = Plan.load(path)
+        for seed in seeds:
+            trace = tour(plan, steps, seed, noise.odometry, scale=noise.scale, bend=noise.bend)
+            yield told(f"{plan.name}, {seed}", trace)
+
+
+def aces3(seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
+    trace = Trace.load(ROOT / "examples" / "aces3-route.jsonl")
+    truth = [(step.truth["place"], step.truth["heading"]) for step in trace.steps]
+    poses: list[Pose] = [(*ACES3[place], COMPASS[heading]) for place, heading in truth]
+    for seed in seeds:
+        driven = displaced(trace, poses, noise.odometry, seed, scale=noise.scale, bend=noise.bend)
+        yield Known(f"ACES3, {seed}", driven, tuple(truth), tuple(place for place, _ in truth))
+
+
+def taylor_hall(tours: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
+    """Tours of Taylor Hall, with the robot's own odometry. Each is simulated in a process of its own, whose memory does not count."""
+    for seed in seeds:
+        with ProcessPoolExecutor(1, get_context("spawn")) as process:
+            trace = process.submit(drive, tours, seed, Body(scale=noise.scale, bend=noise.bend)).result()
+        yield told(f"Taylor Hall, {seed}", trace)
+
+
+def drive(tours: int, seed: int, body: Body) -> Trace:
+    """Tours of Taylor Hall, whose images are clustered into views."""
+    from perception.images import images_of
+    from perception.reciprocal import ReciprocalTransformer
+    from perception.views import ViewClusterer
+    from simulator.tours import simulate
+    from simulator.world import World
+
+    trace = simulate(World.named("taylor-hall"), tours, seed, body=body)
+    clusterer = ViewClusterer(k_max=24, random_state=seed)
+    return trace.with_views(clusterer.fit(ReciprocalTransformer().fit_transform(images_of(trace))).labels_.tolist())
+
+
+def told(name: str, trace: Trace) -> Known:
+    """A trace whose steps tell their true dstate and place."""
+    return Known(name, trace, *(tuple(step.truth[kind] for step in trace.steps) for kind in ("dstate", "place")))
+
+
+def row(known: Known, theory: Theory, limit: float) -> tuple[str, bool, float]:
+    """A row of the table, whether all minimal maps are true and proven minimal, and the seconds that it took."""
+    began = time.perf_counter()
+    solution = solve(known.trace, theory, limit=limit)
+    seconds = time.perf_counter() - began
+    right = [is_true(ssh_map, known) for ssh_map in solution.maps]
+    all_true = solution.complete and bool(right) and all(right)
+    cost = f"{solution.cost.dstates}, {solution.cost.places}, {solution.cost.paths}" if solution.cost else "–"
+    truth = f"{len(set(known.dstates))}, {len(set(known.places))}"
+    listed = f"{sum(right)} of {len(right)}{'' if solution.complete else ' or more'}"
+    return (
+        f"| {known.name} | {len(known.trace)} | {truth} | {solution.status.value} | {cost} | {listed} | {seconds:.2f} |",
+        all_true,
+        seconds,
+    )
+
+
+def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
+    """Solve each trace, print a row for each, and return the sum."""
+    print(
+        "| trace | steps | true dstates, places | status | dstates, places, paths | true maps | s |\n|---|---|---|---|---|---|---|",
+        flush=True,
+    )
+    found = []
+    for known in traces:
+        text, right, seconds = row(known, theory, limit)
+        print(text, flush=True)
+        found.append((right, seconds))
+    if not found:
+        return "no traces"
+    return f"all minimal maps are true: {sum(right for right, _ in found)} of {len(found)}; median {statistics.median(s for _, s in found):.2f} s"
+
+
+def arguments() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--family", choices=("mazes", "plans", "aces3", "taylor-hall"), required=True)
+    parser.add_argument("--seeds", type=int, metavar="N", help="traces; of each plan (default 10; plans 1, taylor-hall 20)")
+    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)")
+    parser.add_argument("--cells", type=int, default=4, metavar="N", help="mazes of N x N cells (default 4)")
+    parser.add_argument("--steps", type=int, metavar="N", help="actions of the robot (default: mazes 40, plans 100)")
+    parser.add_argument("--tours", type=int, default=10, metavar="N", help="tours of Taylor Hall (default 10)")
+    parser.add_argument("--folder", type=Path, default=ROOT.parent / "shared" / "data" / "plans", metavar="FOLDER", help="of the plans")
+    parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)")
+    parser.add_argument("--stars", action="store_true", help="the solver is told of stars, too")
+    for name in ("displacement", "boundary", "prefer"):
+        parser.add_argument(f"--{name}", metavar="CHOICE", help=f"of the theory's field {name}")
+    for name in NUMBERS:
+        parser.add_argument(f"--{name}", type=float, default=NOISE[name], metavar="X", help=f"of Odometry (default {NOISE[name]})")
+    parser.add_argument("--scale-error", type=float, default=0.0, metavar="SHARE", help="all ways are reported longer by this (default 0)")
+    parser.add_argument("--bend-error", type=float, default=0.0, metavar="DEGREES", help="drift of the heading in each metre (default 0)")
+    return parser
+
+
+def chosen(options: argparse.Namespace) -> Iterator[Known]:
+    """The traces that are asked for."""
+    noise = Noise(Odometry(**{name: getattr(options, name) for name in NUMBERS}), options.scale_error, math.radians(options.bend_error))
+
+    def seeds(count: int) -> range:
+        return range(options.first, options.first + (options.seeds or count))
+
+    match options.family:
+        case "mazes":
+            return mazes(options.cells, options.steps or 40, seeds(10), noise)
+        case "plans":
+            if not options.folder.is_dir():
+                sys.exit(f"--folder: expected a folder of plans, got {options.folder}; name one")
+            return plans(options.folder, options.steps or 100, seeds(1), noise)
+        case "aces3":
+            return aces3(seeds(10), noise)
+    return taylor_hall(options.tours, seeds(20), noise)
+
+
+def main() -> None:
+    options = arguments().parse_args()
+    choices = {name: value for name in ("displacement", "boundary", "prefer") if (value := getattr(options, name))}
+    theory = Theory.topological().replace(**choices, **({} if options.stars else {"star": "none"}))
+    print(f"\n{report(chosen(options), theory, options.limit)}")
+
+
+if __name__ == "__main__":
+    main()

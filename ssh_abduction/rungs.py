@@ -1,0 +1,92 @@
+"""What each kind of evidence is worth for a trace: the minimal maps by views alone, and then with one kind more on each rung.
+
+>>> from ssh_abduction import Theory, Trace
+>>> from ssh_abduction.rungs import ladder
+>>> square = [(10, 0, 0), (0, 0, -1.5708)] * 4
+>>> trace = Trace.from_steps("ab" * 4 + "a", ["travel", "right"] * 4, displacements=square)
+>>> [(rung.name, rung.solution.cost.places, rung.solution.count) for rung in ladder(trace)]
+[('views', 3, 1), ('+ pairs', 4, 1), ('+ geometry', 4, 1)]
+
+A square whose corners look alike is explained by a triangle, unless displacements say otherwise. Each rung is a theory of its own, and its maps are solved for from scratch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+from ssh_abduction.evaluation import Evaluation, evaluate
+from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.search import solve
+from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.trace import Trace, checked_trace
+
+
+@dataclass(frozen=True, slots=True)
+class Rung:
+    """One kind of evidence more.
+
+    name        what the rung adds
+    solution    the minimal maps by all evidence up to it
+    evaluation  how right they are; None where the trace has no truth, or there is no map
+    """
+
+    name: str
+    solution: Solution
+    evaluation: Evaluation | None
+
+    @property
+    def rank(self) -> int | None:
+        """Which of the minimal maps is the true one, counted from 1; None if none is, or if that is not known."""
+        return self.evaluation.rank if self.evaluation else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The rung as plain data, as `ladder --json` prints it."""
+        solution = self.solution
+        best = self.evaluation.maps[0] if self.evaluation else None
+        return {
+            "name": self.name,
+            "status": solution.status.value,
+            "complete": solution.complete,
+            "count": solution.count,
+            "cost": solution.cost.to_dict() if solution.cost else None,
+            "rank": self.rank,
+            "accuracy": best.accuracy if best else None,
+            "seconds": round(solution.seconds.total, 3),
+        }
+
+
+def rungs(trace: Trace, theory: Theory) -> Iterator[tuple[str, Theory]]:
+    """The theories of the ladder, each with one kind of evidence more, as far as the trace has it."""
+    choices: dict[str, Any] = {"star": "none", "displacement": "none"}
+    has_planarity = any(field.name == "planar" for field in fields(theory))
+    if has_planarity:
+        choices["planar"] = False
+    theory = theory.replace(**choices)
+    yield "views", theory
+    topological = theory.level == "topological"
+    if topological and trace.has_stars:
+        theory = theory.replace(star="auto")
+        yield "+ star", theory
+    if trace.has_displacements:
+        theory = theory.replace(displacement="use", joint=1)
+        yield "+ pairs", theory
+        theory = theory.replace(joint=2)
+        yield "+ geometry", theory
+    if topological and has_planarity:
+        yield "+ planarity", theory.replace(planar=True)
+
+
+def ladder(trace: Trace, theory: Theory | None = None, *, limit: float | None = None, maps: int = 100) -> Iterator[Rung]:
+    """The rungs of a trace, as they are solved.
+
+    theory  the other choices; Theory.topological() by default. What it says of stars, displacements and planarity is laid over
+    limit   seconds for each rung
+    maps    so many minimal maps, at most, are listed and evaluated on each rung
+    """
+    checked_trace(trace)
+    has_truth = any(step.truth is not None for step in trace)
+    for name, chosen in rungs(trace, checked_theory(theory)):
+        solution = solve(trace, chosen, limit=limit, maps=maps)
+        yield Rung(name, solution, evaluate(solution.maps, trace) if has_truth and solution.maps else None)

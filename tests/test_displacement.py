@@ -1,0 +1,248 @@
+"""Displacements as evidence: loops, refused returns, fits, and what is said of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from brute_geometry import Geometry
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.optimize import approx_fprime
+from strategies import theories, traces
+from test_property import agree
+
+from ssh_abduction import Odometry, SSHMap, Theory, TheoryError, Trace, solve
+from ssh_abduction.asp.facts import causal_map
+from ssh_abduction.fit import _Problem, fit
+from ssh_abduction.judge.checker import check
+from ssh_abduction.solver.ranking import noise_warning
+from ssh_abduction.theory.evidence import pairs_of
+from ssh_abduction.theory.evidence.displacement import Displacement, Returns
+from ssh_abduction.theory.loops import Loops
+
+ROOM = 10.0  # metres from corner to corner
+WHITE = Odometry(scale=0.0, bend=0.0)
+
+
+def circuit(
+    corners: int, sides: int, noise: float = 0.0, seed: int = 0, odometry: Odometry = WHITE, scale: float = 0.0, bend: float = 0.0
+) -> Trace:
+    """A robot that drives round a regular polygon to the right, so many sides, all corners of which look alike.
+
+    noise  standard deviations of its displacements, as a share of those that the odometry claims
+    scale, bend  errors that repeat
+    """
+    rng = np.random.default_rng(seed)
+    moved = []
+    for step in range(2 * sides):
+        true = (0.0, 0.0, -math.tau / corners) if step % 2 else (ROOM, 0.0, 0.0)
+        error = rng.multivariate_normal(np.zeros(3), np.array(odometry.covariance(true))) * noise
+        way = math.hypot(*true[:2])
+        turned = bend * way
+        ahead, left = (1 + scale) * way * math.cos(turned / 2), (1 + scale) * way * math.sin(turned / 2)
+        moved.append((ahead + error[0], left + error[1], true[2] + turned + error[2]))
+    views = [("after", "before")[step % 2] for step in range(2 * sides + 1)]
+    return Trace.from_steps(views, ["travel", "right"] * sides, displacements=moved, odometry=odometry)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.data())
+def test_solver_and_checker_agree_with_matrices_written_out(data: st.DataObject) -> None:
+    trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")
+    theory = data.draw(theories(trace, fixed=("displacement",)), label="theory")
+    agree(trace, theory)
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(st.integers(0, 10_000), st.integers(3, 6), st.sampled_from([1.0, 2.0, 3.0]), st.sampled_from([0.0, 0.01]))
+def test_sets_of_two_are_those_of_matrices_written_out(seed: int, corners: int, noise: float, bend: float) -> None:
+    """Labels that need not be a map's: every second step is at one of few dstates, so that many returns share displacements."""
+    odometry = replace(WHITE, bend=bend)
+    trace = circuit(corners, 5, noise, seed, odometry)
+    theory = Theory.causal().replace(reject=0.3).resolve(trace)
+    rng = np.random.default_rng(seed)
+    labels = tuple(int(2 * rng.integers(2) + step % 2) for step in range(len(trace)))
+    returns, written_out = Returns(Displacement.of(theory), trace), Geometry(trace, theory)
+    ssh_map = causal_map(labels, trace)
+    labels = ssh_map.labels
+    refused = returns.refused_together(ssh_map)
+    pairs = [(i, j, 3) for j in range(len(labels)) for i in range(j) if labels[i] == labels[j]]
+    expected = {(a, b) for a in pairs for b in pairs if a < b and written_out.refuses((a, b))}
+    assert (refused is None) == (not expected)
+    if refused:
+        first, second = sorted((e.first, e.second, 3) for e in refused)
+        assert (first, second) in expected
+    apart = {(i, j) for j, others in returns.pairs.apart.items() for i in others}
+    assert apart == {
+        (i, j) for j in range(len(labels)) for i in range(j) if trace.views[i] == trace.views[j] and written_out.refuses(((i, j, 3),))
+    }
+
+
+def test_covariances_of_closings_are_those_of_many_noisy_drives() -> None:
+    """To first order: the noise is a hundredth of what the covariance is for."""
+    odometry = Odometry(along=0.05, across=0.03, heading=0.004, turning=0.02, position=0.1, angle=0.02, scale=0.0, bend=0.0)
+    little = Odometry(
+        **{name: getattr(odometry, name) / 100 for name in ("along", "across", "heading", "turning", "position", "angle")},
+        scale=0.0,
+        bend=0.0,
+    )
+    true = Loops.of(circuit(5, 4, 0.0, 0, little)).poses
+
+    def closing(poses: np.ndarray, i: int, j: int) -> np.ndarray:
+        """As seen by somebody who knows the pose at step i."""
+        off, turned = poses[j] - poses[i], true[i, 2] - poses[i, 2]
+        cos, sin = math.cos(turned), math.sin(turned)
+        return np.array([cos * off[0] - sin * off[1], sin * off[0] + cos * off[1], off[2]])
+
+    drives = [Loops.of(circuit(5, 4, 1.0, drive, little)).poses for drive in range(400)]
+    ends = [np.concatenate([closing(poses, 1, 8), closing(poses, 3, 6)]) for poses in drives]
+    measured = np.cov(np.array(ends).T) * 1e4
+    loops = Loops.of(circuit(5, 4, 0.0, 0, odometry))
+    shared = loops.shared(([1], [8]), ([3], [6]))[0]
+    assert measured[:3, 3:] == pytest.approx(shared, abs=0.15 * np.sqrt(np.outer(measured.diagonal()[:3], measured.diagonal()[3:])).max())
+
+
+def test_a_square_whose_corners_look_alike_is_a_square() -> None:
+    trace = circuit(4, 9, 1.0)
+    alone = solve(trace.without_displacements())
+    assert (alone.cost.dstates, alone.cost.places) == (6, 3)  # type: ignore[union-attr]
+    solution = solve(trace)
+    assert (solution.cost.dstates, solution.cost.places) == (8, 4)  # type: ignore[union-attr]
+    assert solution.complete
+    assert solution.count == 1
+    assert solution.evidence["displacement"]["pairs"] > 0
+    assert solution.maps[0].labels == tuple(step % 8 for step in range(19))
+
+
+@pytest.mark.parametrize("corners", [3, 5, 6])
+def test_polygons_are_told_by_displacements_alone(corners: int) -> None:
+    trace = circuit(corners, 2 * corners + 1, 1.0, seed=corners)
+    solution = solve(trace, Theory.causal())
+    assert solution.maps[0].labels == tuple(step % (2 * corners) for step in range(len(trace)))
+    assert solution.count == 1
+
+
+@pytest.mark.parametrize(("scale", "bend"), [(0.1, 0.0), (0.0, math.radians(0.2)), (-0.1, -math.radians(0.2))])
+def test_errors_that_repeat_are_estimated_along(scale: float, bend: float) -> None:
+    trace = circuit(5, 16, 1.0, 1, Odometry(heading=0.001, turning=0.01, angle=0.005), scale, bend)
+    solution = solve(trace, Theory.causal())
+    found = solution.maps[0]
+    assert found.labels == tuple(step % 10 for step in range(len(trace)))
+    assert found.fit is not None
+    assert found.fit.p > 0.001
+    assert found.fit.bend == pytest.approx(bend, abs=0.0015)
+    x, y = found.fit.poses[1].x, found.fit.poses[1].y
+    assert math.hypot(x, y) == pytest.approx(ROOM, rel=0.12)  # loops that close hardly notice the scale
+    stiff = solve(replace(trace, odometry=replace(trace.odometry or WHITE, scale=0.0, bend=0.0)), Theory.causal())
+    if bend:
+        assert stiff.maps[0].labels != found.labels or stiff.odometry_warning
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(st.data())
+def test_the_jacobian_of_a_fit_is_right(data: st.DataObject) -> None:
+    trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")
+    problem = _Problem(trace, solve(trace, Theory.causal().replace(displacement="none")).maps[0])
+    assume(len(problem._moved))
+    rng = np.random.default_rng(0)
+    unknown = problem._begun(None) + 0.01 * rng.normal(size=problem._size)
+    numeric = approx_fprime(unknown, problem._residuals, 1e-7)
+    assert problem._jacobian(unknown).toarray() == pytest.approx(numeric, abs=2e-3)
+
+
+def test_fits_of_true_maps_are_as_likely_as_they_say() -> None:
+    """Of 60 true maps, about half have a p-value above one half, and hardly any one below a thousandth."""
+    chances = []
+    for seed in range(60):
+        trace = circuit(5, 12, 1.0, seed)
+        chances.append(fit(trace, true_circuit(trace, 5)).p)
+    assert 15 <= sum(p > 0.5 for p in chances) <= 45
+    assert min(chances) > 1e-3
+
+
+def true_circuit(trace: Trace, corners: int) -> SSHMap:
+    return causal_map([step % (2 * corners) for step in range(len(trace))], trace)
+
+
+def test_poses_are_where_the_dstates_are() -> None:
+    trace = circuit(4, 8, 0.3, 2)
+    found = fit(trace, true_circuit(trace, 4))
+    at = [(pose.x, pose.y) for pose in found.poses]
+    for s, corner in enumerate([(0, 0), (10, 0), (10, 0), (10, -10), (10, -10), (0, -10), (0, -10), (0, 0)]):
+        assert at[s] == pytest.approx(corner, abs=0.8)
+    assert found.poses[0].spread == (0.0, 0.0, 0.0)
+    assert all(pose.spread[0] > 0 for pose in found.poses[1:7])
+
+
+@pytest.mark.parametrize(("factor", "said"), [(0.3, "too loose"), (3.0, "too tight"), (1.0, None)])
+def test_a_noise_model_that_is_off_is_noticed(factor: float, said: str | None) -> None:
+    trace = circuit(5, 30, factor, 4)
+    warning = noise_warning(fit(trace, true_circuit(trace, 5)))
+    if said is None:
+        assert warning is None
+        return
+    assert warning is not None
+    assert said in warning
+    assert f"multiply them by {factor:.1g}"[:-1] in warning or abs(float(warning.rsplit(" ", 1)[1]) - factor) < 0.2 * factor
+
+
+def test_the_map_that_closes_best_comes_first_and_rivals_have_weights() -> None:
+    trace = circuit(4, 6, 1.0)
+    theory = Theory.causal().replace(prefer=(), joint=1, reject=1e-9)
+    solution = solve(trace, theory, maps=0)
+    squares = [ssh_map.fit.chi2 for ssh_map in solution.maps if ssh_map.fit]
+    assert len(squares) == solution.count > 1
+    assert squares == sorted(squares)
+    assert sum(solution.weights) == pytest.approx(1.0)
+    assert list(solution.weights) == sorted(solution.weights, reverse=True)
+
+
+def test_steps_without_displacements_cut_what_is_known() -> None:
+    trace = circuit(4, 9, 1.0)
+    cut = replace(trace, steps=tuple(replace(s, displacement=None) if t == 7 else s for t, s in enumerate(trace.steps)))
+    theory = Theory.topological().resolve(cut)
+    pairs = pairs_of(cut, theory)
+    assert pairs.apart
+    assert all((i >= 7) == (j >= 7) for j, others in pairs.apart.items() for i in others)
+    assert solve(cut).complete
+
+
+def test_displacements_may_be_left_out_or_asked_for() -> None:
+    trace = circuit(4, 9, 1.0)
+    assert solve(trace, Theory(displacement="none")).cost == solve(trace.without_displacements()).cost
+    with pytest.raises(TheoryError, match="displacement: expected a trace with displacements"):
+        solve(trace.without_displacements(), Theory(displacement="use"))
+    for wrong in ({"reject": 0.0}, {"reject": 1.5}, {"joint": 3}, {"joint": 0}, {"displacement": "some"}, {"prefer": ("auto", "paths")}):
+        with pytest.raises(TheoryError, match=next(iter(wrong))):
+            Theory(**wrong)  # type: ignore[arg-type]
+
+
+def test_places_go_before_paths_where_displacements_are_used() -> None:
+    trace = circuit(4, 9, 1.0)
+    assert Theory().resolve(trace).prefer == ("dstates", "places", "paths")
+    assert Theory().resolve(trace.without_displacements()).prefer == ("dstates", "paths", "places")
+    assert Theory.causal().resolve(trace).prefer == ("dstates",)
+    assert Theory.circumscriptive().resolve(trace).prefer == ("paths", "places", "dstates")
+
+
+def test_the_checker_says_which_returns_are_refused() -> None:
+    trace = circuit(4, 9, 1.0)
+    wrong = solve(trace, Theory(displacement="none")).maps[0]
+    said = [violation for violation in check(trace, wrong, Theory(displacement="use", prefer=())) if violation.axiom == "one_pose"]
+    assert said
+    assert "By the displacements it cannot be that" in said[0].message
+
+
+def test_maps_with_a_fit_survive_a_round_trip(tmp_path: Path) -> None:
+    found = solve(circuit(4, 9, 1.0)).maps[0]
+    found.save(tmp_path / "map.json")
+    again = SSHMap.load(tmp_path / "map.json")
+    assert again == found
+    assert again.fit is not None
+    assert found.fit is not None
+    assert again.fit.chi2 == pytest.approx(found.fit.chi2, abs=1e-5)
+    assert [p.x for p in again.fit.poses] == pytest.approx([p.x for p in found.fit.poses], abs=1e-3)
