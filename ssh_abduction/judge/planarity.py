@@ -19,8 +19,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
+from ssh_abduction.star import Openings
 from ssh_abduction.theory.drawing import can_be_drawn
-from ssh_abduction.trace import Openings
 
 Arm: TypeAlias = tuple[int, int]  # of a dstate, ahead (1) or behind (-1)
 Option: TypeAlias = Mapping[Arm, int]  # the position of each arm around its place, clockwise; those of one gateway have one

@@ -26,9 +26,8 @@ is next to nothing, and where it is lost nothing can be said any more.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from threading import Lock
 from typing import TypeAlias
 
 import numpy as np
@@ -48,6 +47,10 @@ LOST = 1.0
 BENDS_A_SIGMA = 2
 # Drifts of more standard deviations than this are as unlikely as what is refused.
 MOST_BENDS = 6
+# So many steps are worked on in one go: what is computed on the way takes some ten megabytes.
+AT_A_TIME = 1000
+# The columns of what is known of a step: its pose, and sums up to it.
+COLUMNS = 3 + 17 + 3
 
 
 @dataclass(frozen=True)
@@ -78,40 +81,13 @@ class Loops:
         bend   that drift, in radians a metre
         drift  standard deviation of the drift that is left; what the odometry says if not given
         """
-        size = len(trace)
         odometry = trace.odometry or Odometry()
-        moved, noise = np.zeros((size, 3)), np.zeros((size, 3, 3))
-        known = np.zeros(size, dtype=bool)
-        for t in range(1, size):
-            displacement = trace.steps[t].displacement
-            if displacement is not None:
-                moved[t], noise[t], known[t] = displacement, trace.covariance(t), True
-        way = np.hypot(moved[:, 0], moved[:, 1])
-        moved[:, :2] = _turned(moved[:, :2], -bend * way / 2)
-        moved[:, 2] -= bend * way
-        heading = np.cumsum(moved[:, 2])
-        before = heading - moved[:, 2]  # the heading in which each displacement begins
-        position = np.cumsum(_turned(moved[:, :2], before), axis=0)
-        rotation = np.zeros((size, 3, 3))
-        rotation[:, 0, 0] = rotation[:, 1, 1] = np.cos(before)
-        rotation[:, 1, 0], rotation[:, 0, 1], rotation[:, 2, 2] = np.sin(before), -np.sin(before), 1.0
-        noise = rotation @ noise @ rotation.transpose(0, 2, 1)
-        across = _quarter_turned(position)
-        angle, mixed = noise[:, 2, 2], noise[:, :2, 2]
-        columns = [
-            noise[:, :2, :2].reshape(-1, 4),
-            mixed,
-            (mixed[:, :, None] * across[:, None, :]).reshape(-1, 4),
-            angle[:, None],
-            angle[:, None] * across,
-            (angle[:, None, None] * across[:, :, None] * across[:, None, :]).reshape(-1, 4),
-        ]
-        middle = position - _turned(moved[:, :2], before) / 2
-        ways = np.hstack([way[:, None], way[:, None] * _quarter_turned(middle)])
-        part = np.cumsum(~known) - (not known[0])
-        drift = odometry.bend if drift is None else drift
-        poses = np.hstack([position, heading[:, None]])
-        return Loops(poses, part, np.cumsum(np.hstack(columns), axis=0), np.cumsum(ways, axis=0), odometry, bend, drift)
+        sums = _sums(trace, 0, len(trace), np.array([bend]), np.zeros((1, COLUMNS)))[0]
+        return Loops._of(sums, _parts(trace), odometry, bend, odometry.bend if drift is None else drift)
+
+    @staticmethod
+    def _of(sums: Array, part: Steps, odometry: Odometry, bend: float, drift: float) -> Loops:
+        return Loops(sums[..., :3], part, sums[..., 3:20], sums[..., 20:], odometry, bend, drift)
 
     def closings(self, first: ArrayLike, last: ArrayLike) -> tuple[Array, Array]:
         """How far off loops close, m x 3, and the covariance of that, m x 3 x 3; in metres and radians, and in the frame of the first step of the trace.
@@ -196,33 +172,157 @@ class Loops:
         moved: Array = np.maximum(white, 0.0) + self.drift**2 * (self._by_bend(i, j)[:, :2] ** 2).sum(1)
         return moved
 
-    @cached_property
-    def begins(self) -> Steps:
-        """For each step, the first step from which on it is known where this one is: no displacement is missing since, and the heading is not lost."""
-        angle, way, part = self.moments[:, 10].tolist(), self.ways[:, 0].tolist(), self.part.tolist()
-        begins, begin = [], 0
-        for t in range(len(part)):  # the beginning never goes back, as the heading gets no better
-            while part[begin] < part[t] or angle[t] - angle[begin] + (self.drift * (way[t] - way[begin])) ** 2 > LOST**2:
-                begin += 1
-            begins.append(begin)
-        return np.array(begins)
+    def of_ends(self, end: int) -> Array:
+        """What the noise of the displacements up to each step contributes to the covariance of where the robot is at step `end`, n x 9."""
+        every = np.arange(end + 1)
+        there = np.full(end + 1, end)
+        return self._white(np.zeros_like(every), every, there, there).reshape(-1, 9)
 
-    def unlost(self, first: Steps, last: Steps) -> NDArray[np.bool_]:
-        """Whether something is known of loops: no displacement in them is missing, and the heading is not lost."""
-        known: NDArray[np.bool_] = first >= self.begins[last]
-        return known
+    def noise(self, first: Steps, last: Steps) -> Array:
+        """What the noise of the displacements from one step to a later one contributes to the covariance of where the robot is at the later one, m x 3 x 3."""
+        return self._white(first, last, last, last)
+
+    def repeated(self, first: Steps, last: Steps) -> Array:
+        """What a wrong scale and a steady drift contribute to the covariances of closings, m x 3 x 3."""
+        return self._repeated((first, last), (first, last))
 
 
-def bends(trace: Trace) -> Iterator[tuple[Loops, float]]:
-    """The loops of a trace for each drift of heading that it may have, and the chi-square of that drift. No drift comes first."""
-    sigma = (trace.odometry or Odometry()).bend
-    if not sigma:
-        yield Loops.of(trace), 0.0
-        return
-    step = sigma / BENDS_A_SIGMA
-    for number in sorted(range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1), key=abs):
-        nearest = max(abs(number) - 0.5, 0.0) * step  # of the drifts that this one stands for
-        yield Loops.of(trace, number * step, step / 2), (nearest / sigma) ** 2
+class Reckoning:
+    """Dead reckoning of a trace, for each drift of heading that it may have. No drift comes first.
+
+    bends     the drifts, in radians a metre
+    unlikely  the chi-square of each
+    begins    for each step, the first step from which on it is known where this one is: no displacement is missing since, and the heading is not lost.
+              That is the same whatever the drift, and of a longer trace, too
+    """
+
+    def __init__(self, trace: Trace, before: Reckoning | None = None) -> None:
+        """The reckoning of a trace.
+
+        before  that of a trace which has grown to this one
+        """
+        self.odometry = trace.odometry or Odometry()
+        sigma = self.odometry.bend
+        step = sigma / BENDS_A_SIGMA
+        numbers = sorted(range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1), key=abs) if sigma else [0]
+        self.bends = [number * step for number in numbers]
+        # Each drift stands for those around it, and counts as the nearest of them.
+        self.unlikely = [(max(abs(number) - 0.5, 0.0) / BENDS_A_SIGMA) ** 2 for number in numbers]
+        self._drift = step / 2
+        self._size = len(trace)
+        start = before._size if before else 0
+        last = before._rows.array[:, start - 1] if before else np.zeros((len(numbers), COLUMNS))
+        new = np.empty((len(numbers), self._size - start, COLUMNS))
+        for at in range(start, self._size, AT_A_TIME):
+            stop = min(at + AT_A_TIME, self._size)
+            new[:, at - start : stop - start] = _sums(trace, at, stop, np.array(self.bends), last)
+            last = new[:, stop - start - 1]
+        self._rows: _Rows = before._rows.extended(start, new) if before else _Rows(new)
+        self._part: Steps = np.concatenate([before._part, _parts(trace, start, int(before._part[-1]))]) if before else _parts(trace)
+        self.begins: Steps = self._begins(before.begins if before else np.zeros(0, dtype=int))
+
+    def loops(self, number: int) -> Loops:
+        """The loops for one of the drifts."""
+        return Loops._of(self._rows.array[number, : self._size], self._part, self.odometry, self.bends[number], self._drift)
+
+    def loops_of_unknown_drift(self) -> Loops:
+        """The loops without a drift, where any that the odometry allows is left."""
+        return Loops._of(self._rows.array[0, : self._size], self._part, self.odometry, 0.0, self.odometry.bend)
+
+    def closings(self, numbers: Steps, first: Steps, last: Steps) -> tuple[Array, Array]:
+        """As `Loops.closings`, but for loops each of which has a drift of its own."""
+        array = self._rows.array
+        flat = Loops._of(array.reshape(-1, COLUMNS), self._part, self.odometry, 0.0, self._drift)
+        offset = numbers * array.shape[1]
+        return flat.closings(first + offset, last + offset)
+
+    def _begins(self, known: Steps) -> Steps:
+        loops = self.loops(0)
+        start = len(known)
+        begin = int(known[-1]) if start else 0
+        since = slice(begin, None)
+        angle, way, part = loops.moments[since, 10].tolist(), loops.ways[since, 0].tolist(), loops.part[since].tolist()
+        found, shift = [], begin
+        for t in range(start - shift, len(part)):  # the beginning never goes back, as the heading gets no better
+            here = begin - shift
+            while part[here] < part[t] or angle[t] - angle[here] + (self._drift * (way[t] - way[here])) ** 2 > LOST**2:
+                here += 1
+            begin = here + shift
+            found.append(begin)
+        return np.concatenate([known, np.array(found, dtype=int)])
+
+
+class _Rows:
+    """Rows of numbers for each drift, drifts x rows x columns, to which more are added where room was left: so a step costs what it adds, mostly."""
+
+    def __init__(self, array: Array, size: int | None = None) -> None:
+        self.array = array
+        self._size = array.shape[1] if size is None else size
+        self._lock = Lock()
+
+    def extended(self, size: int, new: Array) -> _Rows:
+        """The first `size` rows, and new ones. The array is the same, unless there is no room or somebody else added other rows."""
+        total = size + new.shape[1]
+        with self._lock:
+            if self._size == size and total <= self.array.shape[1]:
+                self.array[:, size:total] = new
+                self._size = total
+                return self
+        array = np.zeros((len(new), 2 * total, new.shape[2]))
+        array[:, :size], array[:, size:total] = self.array[:, :size], new
+        return _Rows(array, total)
+
+
+def _parts(trace: Trace, start: int = 0, missing: int = 0) -> Steps:
+    """For each step from `start` on, the number of displacements that are missing up to it, where so many are missing before."""
+    unknown = [t > 0 and trace.steps[t].displacement is None for t in range(start, len(trace))]
+    parts: Steps = missing + np.cumsum(unknown, dtype=int)
+    return parts
+
+
+def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Array:
+    """The poses, moments and ways of some steps, as in Loops, for each drift: drifts x steps x COLUMNS.
+
+    last  those of the step before, drifts x COLUMNS; zeros where there is none
+    """
+    moved, noise = np.zeros((stop - start, 3)), np.zeros((stop - start, 3, 3))
+    for t in range(max(start, 1), stop):
+        displacement = trace.steps[t].displacement
+        if displacement is not None:
+            moved[t - start], noise[t - start] = displacement, trace.covariance(t)
+    way = np.hypot(moved[:, 0], moved[:, 1])
+    turned = moved[:, 2] - bends[:, None] * way
+    straight = _turned(moved[None, :, :2], -bends[:, None] * way / 2)
+    heading = _summed(last[:, 2], turned)
+    before = heading - turned  # the heading in which each displacement begins
+    onward = _turned(straight, before)
+    position = _summed(last[:, :2], onward)
+    rotation = np.zeros((*before.shape, 3, 3))
+    rotation[..., 0, 0] = rotation[..., 1, 1] = np.cos(before)
+    rotation[..., 1, 0], rotation[..., 0, 1], rotation[..., 2, 2] = np.sin(before), -np.sin(before), 1.0
+    noise = rotation @ noise @ rotation.swapaxes(-1, -2)
+    across = _quarter_turned(position)
+    angle, mixed = noise[..., 2, 2], noise[..., :2, 2]
+    middle = position - onward / 2
+    ways = np.broadcast_to(way, before.shape)[..., None]
+    columns = [
+        noise[..., :2, :2].reshape(*before.shape, 4),
+        mixed,
+        (mixed[..., :, None] * across[..., None, :]).reshape(*before.shape, 4),
+        angle[..., None],
+        angle[..., None] * across,
+        (angle[..., None, None] * across[..., :, None] * across[..., None, :]).reshape(*before.shape, 4),
+        ways,
+        ways * _quarter_turned(middle),
+    ]
+    sums = _summed(last[:, 3:], np.concatenate(columns, axis=-1))
+    return np.concatenate([position, heading[..., None], sums], axis=-1)
+
+
+def _summed(before: Array, values: Array) -> Array:
+    """Sums of values along the second axis, which go on from what was summed before."""
+    summed: Array = np.cumsum(np.concatenate([before[:, None], values], axis=1), axis=1)[:, 1:]
+    return summed
 
 
 def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
@@ -238,11 +338,11 @@ def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
 
 
 def _turned(vectors: Array, angles: Array) -> Array:
-    """Vectors, n x 2, turned counterclockwise by n angles."""
+    """Vectors, ... x 2, turned counterclockwise by angles."""
     cos, sin = np.cos(angles), np.sin(angles)
-    return np.stack([cos * vectors[:, 0] - sin * vectors[:, 1], sin * vectors[:, 0] + cos * vectors[:, 1]], axis=1)
+    return np.stack([cos * vectors[..., 0] - sin * vectors[..., 1], sin * vectors[..., 0] + cos * vectors[..., 1]], axis=-1)
 
 
 def _quarter_turned(vectors: Array) -> Array:
-    """Vectors, n x 2, turned counterclockwise by a quarter."""
-    return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)
+    """Vectors, ... x 2, turned counterclockwise by a quarter."""
+    return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)

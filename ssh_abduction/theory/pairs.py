@@ -34,7 +34,7 @@ class Pairs:
         """What several kinds of evidence say together."""
         if len(several) <= 1:
             return several[0] if several else NO_PAIRS
-        return Pairs.of(*([pair for pairs in several for pair in pairs_in(getattr(pairs, name))] for name in ("apart", "elsewhere", "one")))
+        return Pairs(*(_united([getattr(pairs, name) for pairs in several]) for name in ("apart", "elsewhere", "one")))
 
     def __bool__(self) -> bool:
         return bool(self.apart or self.one)
@@ -70,6 +70,16 @@ class Pairs:
 def pairs_in(earlier: Earlier) -> list[tuple[int, int]]:
     """The pairs of a mapping: the earlier step, and the later one."""
     return [(i, t) for t, others in earlier.items() for i in others]
+
+
+def _united(several: Sequence[Earlier]) -> Earlier:
+    """All pairs of these mappings."""
+    first, *rest = several
+    united = dict(first)
+    for earlier in rest:
+        for t, others in earlier.items():
+            united[t] = united[t] | others if t in united else others
+    return united
 
 
 def _earlier(pairs: Iterable[tuple[int, int]]) -> dict[int, frozenset[int]]:

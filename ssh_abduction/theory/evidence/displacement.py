@@ -19,26 +19,29 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from operator import is_
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.evidence.protocol import Equality
-from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
+from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
 from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from ssh_abduction.theory.loops import Array, Loops, Steps
+    from ssh_abduction.theory.loops import Reckoning, Steps
     from ssh_abduction.theory.theory import Theory
+    from ssh_abduction.theory.together import Mask, Together
 
-Return: TypeAlias = tuple[int, int, bool]  # steps I < J, and whether they are one dstate, rather than at one place only
+# The first steps and the last ones of returns, of places (True) and of dstates (False).
+_Tested: TypeAlias = "dict[bool, tuple[Steps, Steps]]"
 
 # So many loops are worked on in one go: their sums take some hundred megabytes.
 AT_A_TIME = 200_000
+# So many maps of one trace that were accepted are remembered, as they may be asked about again, or go on as the trace grows.
+REMEMBERED = 64
 
 
 @dataclass(frozen=True)
@@ -65,103 +68,138 @@ class Displacement:
     def facts(self, trace: Trace, start: int, stop: int) -> str:
         return ""
 
-    def refuse(self, trace: Trace, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        return self._of(trace).refused_together(ssh_map) if self.joint > 1 else None
+    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
+        return self._of(trace).refused_together(ssh_map, since) if self.joint > 1 else None
 
     def _of(self, trace: Trace) -> Returns:
         return _returns(self, trace)
 
 
-_KEPT: deque[Returns] = deque(maxlen=4)  # the returns that were asked for last, as several parts of a search ask for them
+# The returns that were asked for last: several parts of a search ask for them, and as a trace grows they are those of fewer steps, and some more.
+_KEPT: deque[Returns] = deque(maxlen=8)
 
 
 def _returns(evidence: Displacement, trace: Trace) -> Returns:
     """The returns of a trace, made when they are first asked for."""
-    for known in list(_KEPT):
+    kept = list(_KEPT)
+    for known in kept:
         if known.trace is trace and known.evidence == evidence:
             return known
-    _KEPT.append(found := Returns(evidence, trace))
+    before = next((known for known in reversed(kept) if known.evidence == evidence and _has_grown(known.trace, trace)), None)
+    reckoning = next((known.reckoning for known in kept if known.trace is trace), None)
+    found = Returns(evidence, trace, before, reckoning)
+    if before:
+        with suppress(ValueError):  # another thread was faster
+            _KEPT.remove(before)
+    _KEPT.append(found)
     return found
+
+
+def _has_grown(before: Trace, trace: Trace) -> bool:
+    """Whether a trace is another one, and perhaps some more steps."""
+    last = len(before) - 1
+    if last >= len(trace) or before.odometry != trace.odometry:
+        return False
+    old, new = before.steps[last], trace.steps[last]
+    if (old.view, old.displacement, old.covariance) != (new.view, new.displacement, new.covariance):
+        return False
+    return all(map(is_, before.steps[:last], trace.steps[:last]))
 
 
 def count_returns(trace: Trace, theory: Theory) -> int:
     """How many returns of a trace may be true, rounded up to a power of two. A trace may be as long as it likes, and have as few."""
-    return Returns(Displacement.of(theory), trace).count()
+    return _returns(Displacement.of(theory.replace(returns=0)), trace).count()
 
 
 class Returns:
     """The returns that a trace may have, and which of them are refused."""
 
-    def __init__(self, evidence: Displacement, trace: Trace) -> None:
-        self.evidence, self.trace = evidence, trace
-        self._accepted: frozenset[Return] = frozenset()  # no two of these are refused together
+    def __init__(self, evidence: Displacement, trace: Trace, before: Returns | None = None, reckoning: Reckoning | None = None) -> None:
+        """Nothing is tested yet, but what was tested before.
 
-    @cached_property
+        before     the returns of the first steps, if these are known
+        reckoning  that of the trace, if it is known
+        """
+        from ssh_abduction.theory.loops import Reckoning  # loads numpy
+
+        self.evidence, self.trace = evidence, trace
+        self.reckoning: Reckoning = reckoning or Reckoning(trace, before.reckoning if before else None)
+        self._accepted: dict[_Course, Together] = dict(before._accepted) if before else {}  # the last one last
+        self._pairs: Pairs | None = before._pairs if before else None
+        self._likely: int | None = before._likely if before else None
+        if before and (self._pairs is not None or self._likely is not None):
+            since = len(before.trace)
+            tested = self._tested(since)
+            if self._pairs is not None:
+                self._pairs = Pairs.joined([self._pairs, self._pairs_of(tested, since)])
+            if self._likely is not None:
+                self._likely += self._likely_among(tested)
+
+    @property
     def pairs(self) -> Pairs:
         """The pairs of steps that are not at one place, or not one dstate."""
-        if not self.trace.has_displacements:
-            return NO_PAIRS
-        far = [self._refused_at(places=True), self._refused_at(places=False)]
-        elsewhere = [(int(i), int(j)) for i, j in zip(*far[0], strict=True)]
-        apart = [(int(i), int(j)) for i, j in zip(*far[1], strict=True)]
-        return Pairs.of([*apart, *self._steps_of_visits(elsewhere)], elsewhere)
+        if self._pairs is None:
+            self._pairs = self._pairs_of(self._tested())
+        return self._pairs
+
+    def count(self) -> int:
+        """How many returns may be true, rounded up to a power of two; so many as have a p-value above one half, twice."""
+        if self._likely is None:
+            self._likely = self._likely_among(self._tested())
+        return 1 << max(2 * self._likely - 1, 0).bit_length()
 
     @cached_property
     def arrivals(self) -> list[int]:
         """The first step of each visit: where the robot came to a place. Where it is not known which actions are turns, each step is a visit."""
         return [0, *(t for t, action in enumerate(self.trace.actions, 1) if action.kind != "turn")]
 
-    @cached_property
-    def tested(self) -> dict[bool, tuple[Steps, Steps]]:
-        """The returns of places, and those of dstates, about which displacements say something: their first steps, and their last ones."""
+    def _tested(self, since: int = 0) -> _Tested:
+        """The returns that end at a step from `since` on and about which displacements say something: those of places (True), and those of dstates (False)."""
         views: dict[object, list[int]] = defaultdict(list)
         for t, step in enumerate(self.trace.steps):
             views[step.view if self.evidence.has_one_view else None].append(t)
-        return {
-            True: self._loops_within([self.arrivals] if self.evidence.has_places else []),
-            False: self._loops_within(list(views.values())),
-        }
+        places = [self.arrivals] if self.evidence.has_places else []
+        return {True: self._loops_within(places, since), False: self._loops_within(list(views.values()), since)}
 
-    def _loops_within(self, groups: Sequence[Sequence[int]]) -> tuple[Steps, Steps]:
-        """All loops between two steps of one group about which displacements say something."""
+    def _loops_within(self, groups: Sequence[Sequence[int]], since: int = 0) -> tuple[Steps, Steps]:
+        """All loops between two steps of one group about which displacements say something, and which end at a step from `since` on."""
         import numpy as np
 
-        begins = self._widest.begins
+        begins = self.reckoning.begins
         found: list[tuple[Steps, Steps]] = []
         for group in groups:
+            if group[-1] < since:
+                continue
             steps = np.asarray(group)
-            starts = np.searchsorted(steps, begins[steps])
-            counts = np.arange(len(steps)) - starts
-            last = np.repeat(np.arange(len(steps)), counts)
+            new = np.arange(np.searchsorted(steps, since), len(steps))
+            starts = np.searchsorted(steps, begins[steps[new]])
+            counts = new - starts
+            last = np.repeat(new, counts)
             first = np.arange(len(last)) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(starts, counts)
             found.append((steps[first], steps[last]))
         empty = np.zeros(0, dtype=int)
         return np.concatenate([empty, *(i for i, _ in found)]), np.concatenate([empty, *(j for _, j in found)])
 
-    @cached_property
-    def _bends(self) -> list[tuple[Loops, float]]:
-        from ssh_abduction.theory.loops import bends  # loads numpy
+    def _pairs_of(self, tested: _Tested, since: int = 0) -> Pairs:
+        """The pairs of steps that are told apart by these returns, as they are refused alone. They are all, or those that end at the steps which are new."""
+        far, other = (self._refused_among(*tested[places], places) for places in (True, False))
+        known = self._pairs or NO_PAIRS
+        elsewhere = Pairs.joined([known, Pairs.of(elsewhere=far)]).elsewhere
+        return Pairs.of([*other, *self._steps_of_visits(elsewhere, since)], far)
 
-        return list(bends(self.trace))
-
-    @property
-    def _widest(self) -> Loops:
-        """The loops in which the least is lost: those without a drift."""
-        return self._bends[0][0]
-
-    def count(self) -> int:
-        """How many returns may be true, rounded up to a power of two; so many as have a p-value above one half, twice."""
+    def _likely_among(self, tested: _Tested) -> int:
+        """How many of these returns have a p-value above one half."""
         from scipy.special import gammainccinv
 
-        from ssh_abduction.theory.loops import Loops, chi_squares
+        from ssh_abduction.theory.loops import chi_squares
 
-        loops, likely = Loops.of(self.trace), 0
-        for places, (first, last) in self.tested.items():
+        loops, likely = self.reckoning.loops_of_unknown_drift(), 0
+        for places, (first, last) in tested.items():
             half = 2 * gammainccinv((2 if places else 3) / 2, 0.5)
             for part in _parts(len(first)):
                 squares = chi_squares(*loops.closings(first[part], last[part]))
                 likely += int((squares[0 if places else 1] < half).sum())
-        return 1 << max(2 * likely - 1, 0).bit_length()
+        return likely
 
     def threshold(self, freedom: int, together: bool) -> float:
         """The chi-square above which a return, or a set of two together, is refused.
@@ -175,163 +213,114 @@ class Returns:
         tests = returns * (returns - 1) / 2 if together else returns
         return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
-    def _refused_at(self, places: bool) -> tuple[Steps, Steps]:
-        """The returns of places, or of dstates, that are refused alone."""
-        import numpy as np
-
-        first, last = self.tested[places]
-        refused = np.zeros(len(first), dtype=bool)
-        for part in _parts(len(first)):
-            refused[part] = self._refused(first[part], last[part], places)
-        return first[refused], last[refused]
-
-    def _refused(self, first: Steps, last: Steps, places: bool) -> NDArray[np.bool_]:
-        """Which returns are refused alone: those that close badly whatever drift the heading has."""
+    def _refused_among(self, first: Steps, last: Steps, places: bool) -> list[tuple[int, int]]:
+        """Which of these returns are refused alone: those that close badly whatever drift the heading has."""
         import numpy as np
 
         from ssh_abduction.theory.loops import chi_squares
 
-        most = self.threshold(2 if places else 3, together=False)
-        left = np.arange(len(first))
-        for loops, unlikely in self._bends:
-            if unlikely > most or not len(left):
-                break
-            i, j = first[left], last[left]
-            squares = chi_squares(*loops.closings(i, j))[0 if places else 1] + unlikely
-            left = left[(squares > most) & loops.unlost(i, j)]
-        refused = np.zeros(len(first), dtype=bool)
-        refused[left] = True
-        return refused
+        most, which = self.threshold(2 if places else 3, together=False), 0 if places else 1
+        drifts = [number for number, unlikely in enumerate(self.reckoning.unlikely) if unlikely <= most]
+        for numbers in filter(None, (drifts[:1], drifts[1:])):  # most true returns close without a drift, and most false ones with none
+            refused = np.ones(len(first), dtype=bool)
+            for part in _parts(len(first), AT_A_TIME // max(len(numbers), 1)):
+                i, j = first[part], last[part]
+                closings = self.reckoning.closings(np.repeat(numbers, len(i)), np.tile(i, len(numbers)), np.tile(j, len(numbers)))
+                squares = chi_squares(*closings)[which].reshape(len(numbers), len(i))
+                unlikely = np.array([self.reckoning.unlikely[number] for number in numbers])
+                refused[part] = (squares + unlikely[:, None] > most).all(0)
+            first, last = first[refused], last[refused]
+        return list(zip(first.tolist(), last.tolist(), strict=True))
 
-    def _steps_of_visits(self, elsewhere: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-        """The pairs of steps that show the same view, in visits that are not at one place. Steps that show different views are apart anyway."""
+    def _steps_of_visits(self, elsewhere: Earlier, since: int) -> Iterator[tuple[int, int]]:
+        """The pairs of steps that show the same view, in visits that are not at one place. Steps that show different views are apart anyway.
+
+        elsewhere  the first steps of visits that are not at one place
+        since      only pairs whose later step is this one or one that follows
+        """
         if not self.evidence.turns_stay:
             return
-        shown: dict[int, dict[object, list[int]]] = {}
-        for here, there in zip(self.arrivals, [*self.arrivals[1:], len(self.trace)], strict=True):
-            by_view = shown[here] = defaultdict(list)
-            for t in range(here, there):
-                by_view[self.trace.steps[t].view].append(t)
-        for i, j in elsewhere:
-            for view, steps in shown[i].items():
-                if others := shown[j].get(view):
-                    yield from ((s, t) for s in steps for t in others)
+        end = dict(zip(self.arrivals, [*self.arrivals[1:], len(self.trace)], strict=True))
+        views = self.trace.views
+        for j, others in elsewhere.items():
+            for t in range(max(j, since), end[j]):
+                yield from ((s, t) for i in others for s in range(i, end[i]) if views[s] == views[t])
 
-    def returns_of(self, ssh_map: SSHMap) -> list[Return]:
-        """The returns of a map that are tested together: pairs of visits that begin at one place, or at one dstate, of which displacements say something."""
-        labels = ssh_map.labels
-        arrivals = [t for t in self.arrivals if t < len(labels)]
+    def _returns_of(self, labels: tuple[int, ...], places: tuple[int | None, ...], since: int = 0) -> Steps:
+        """The returns of a map about which displacements say something and that end at a step from `since` on, as rows by last step: pairs of visits that
+        begin at one place, or at one dstate.
+
+        labels  the dstate of each step
+        places  the place of each dstate
+        """
+        import numpy as np
+
         at_dstate: dict[int, list[int]] = defaultdict(list)
         at_place: dict[int | None, list[int]] = defaultdict(list)
-        for t in arrivals:
-            at_dstate[labels[t]].append(t)
-            at_place[ssh_map.dstates[labels[t]].place].append(t)
+        for t in self.arrivals:
+            if t < len(labels):
+                at_dstate[labels[t]].append(t)
+                at_place[places[labels[t]]].append(t)
         at_place.pop(None, None)
-        found: list[Return] = []
+        found = []
         for groups, one_dstate in ((at_dstate, True), (at_place, False)):
-            first, last = self._loops_within(list(groups.values()))
-            found += zip(first.tolist(), last.tolist(), [one_dstate] * len(first), strict=True)
-        return found
+            first, last = self._loops_within(list(groups.values()), since)
+            found.append(np.stack([first, last, np.full(len(first), one_dstate)], axis=1))
+        rows = np.concatenate(found)
+        ordered: Steps = rows[np.argsort(rows[:, 1], kind="stable")]
+        return ordered
 
-    def refused_together(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """The two returns of a map that are refused together most clearly; None where no two are."""
-        if not self.trace.has_displacements:
-            return None
-        returns = frozenset(self.returns_of(ssh_map))
-        worst = self._worst_of(sorted(returns - self._accepted), sorted(returns & self._accepted))
-        if worst is None:
-            self._accepted = returns
-            return None
-        return frozenset(Equality(i, j, "dstate" if one_dstate else "place") for i, j, one_dstate in worst)
+    def refused_together(self, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
+        """The two returns of a map that are refused together most clearly; None where no two are.
 
-    def _worst_of(self, new: Sequence[Return], known: Sequence[Return]) -> tuple[Return, Return] | None:
-        """Of the sets of a new return and another one, new or known, the one that is refused most clearly; None where none is refused."""
+        since  the map of the steps before this one is known to be a map of these: only returns that end later are asked about
+        """
         import numpy as np
 
-        rows = np.array([*known, *new], dtype=int).reshape(-1, 3)
-        if not len(new) or len(rows) < 2:
+        labels, places = ssh_map.labels, tuple(s.place for s in ssh_map.dstates)
+        course = _Course(labels, places)
+        if course in self._accepted:
             return None
-        worst, most = None, 0.0
-        drawn = _Tested(self, rows)
-        for a in range(len(known), len(rows)):
-            partner, excess = drawn.worst_partner(a)
-            if excess > most:
-                worst, most = (rows[a], rows[partner]), excess
-        if worst is None:
-            return None
-        first, second = ((int(i), int(j), bool(one)) for i, j, one in worst)
-        return first, second
+        before = self._accepted.pop(_Course(labels[:since], places), None)
+        rows = self._returns_of(labels, places, since if before else 0)
+        if before:
+            rows = np.concatenate([before.rows, rows])
+        together = self._together(rows, before)
+        worst = together.worst(rows[:, 1] >= since if since else self._is_new(rows))
+        if worst is not None:
+            return frozenset(Equality(int(i), int(j), "dstate" if one_dstate else "place") for i, j, one_dstate in worst)
+        self._accepted[course] = together
+        if len(self._accepted) > REMEMBERED:
+            del self._accepted[next(iter(self._accepted))]
+        return None
 
+    def _together(self, rows: Steps, before: Together | None = None) -> Together:
+        from ssh_abduction.theory.together import Together  # loads numpy
 
-class _Tested:
-    """Returns whose sets of two are tested, one row each: its steps, and whether it is of a dstate."""
+        thresholds = {freedom: self.threshold(freedom, together=True) for freedom in (4, 5, 6)}
+        return Together(self.reckoning, thresholds, rows, before)
 
-    def __init__(self, returns: Returns, rows: Steps) -> None:
-        self._returns, self._rows = returns, rows
-        self._freedom = np_where_dstate(rows)
-        self._known: dict[int, tuple[Array, Array]] = {}
-        self._thresholds = {freedom: returns.threshold(freedom, together=True) for freedom in (4, 5, 6)}
-
-    def worst_partner(self, a: int) -> tuple[int, float]:
-        """Of the returns before row `a`, the one with which it is refused most clearly, and by how much the chi-square is above the threshold; 0 where none is."""
+    def _is_new(self, rows: Steps) -> Mask:
+        """Which returns are not in the map that was accepted last, of which no two are refused together."""
         import numpy as np
 
-        rows = self._rows
-        begin, end = np.maximum(rows[:a, 0], rows[a, 0]), np.minimum(rows[:a, 1], rows[a, 1])
-        partners = np.flatnonzero(begin < end)  # their loops share displacements
-        excess = np.full(len(partners), np.inf)
-        for number, (loops, unlikely) in enumerate(self._returns._bends):
-            left = np.flatnonzero(excess > 0)
-            if not len(left):
-                break
-            excess[left] = np.minimum(excess[left], self._excess(number, loops, a, partners[left]) + unlikely)
-        if not len(partners) or excess.max() <= 0:
-            return 0, 0.0
-        best = int(excess.argmax())
-        return int(partners[best]), float(excess[best])
-
-    def _excess(self, number: int, loops: Loops, a: int, partners: Steps) -> Array:
-        """By how much the chi-square of row `a` together with each of these rows is above the threshold."""
-        import numpy as np
-
-        closing, covariance = self._closings(number, loops)
-        m = len(partners)
-        joint = np.empty((m, 6, 6))
-        joint[:, :3, :3], joint[:, 3:, 3:] = covariance[a], covariance[partners]
-        here = np.repeat(self._rows[a : a + 1], m, axis=0)
-        shared = loops.shared((here[:, 0], here[:, 1]), (self._rows[partners, 0], self._rows[partners, 1]))
-        if not self._rows[a, 2]:
-            shared[:, 2, :] = 0.0
-        shared[self._rows[partners, 2] == 0, :, 2] = 0.0
-        joint[:, :3, 3:], joint[:, 3:, :3] = shared, shared.transpose(0, 2, 1)
-        off = np.concatenate([np.repeat(closing[a : a + 1], m, axis=0), closing[partners]], axis=1)
-        squares = np.einsum("mi,mi->m", off, np.linalg.solve(joint, off[:, :, None])[:, :, 0])
-        most = np.array([self._thresholds[f] for f in (self._freedom[a] + self._freedom[partners]).tolist()])
-        lost = ~loops.unlost(self._rows[partners, 0], self._rows[partners, 1])
-        excess: Array = np.where(lost, -np.inf, squares - most)
-        if not loops.unlost(self._rows[a, 0], self._rows[a, 1]):
-            excess[:] = -np.inf
-        return excess
-
-    def _closings(self, number: int, loops: Loops) -> tuple[Array, Array]:
-        """How far off the loops of all rows close, and the covariances. The heading of a return to a place says nothing, so it is cut off from the rest."""
-        if number not in self._known:
-            closing, covariance = loops.closings(self._rows[:, 0], self._rows[:, 1])
-            places = self._rows[:, 2] == 0
-            closing[places, 2] = 0.0
-            covariance[places, 2, :] = covariance[places, :, 2] = 0.0
-            covariance[places, 2, 2] = 1.0
-            self._known[number] = closing, covariance
-        return self._known[number]
+        if not self._accepted:
+            return np.ones(len(rows), dtype=bool)
+        known = next(reversed(self._accepted.values())).rows
+        size = len(self.trace)
+        codes, known_codes = ((found[:, 0] * size + found[:, 1]) * 2 + found[:, 2] for found in (rows, known))
+        new: Mask = np.isin(codes, known_codes, invert=True)
+        return new
 
 
-def np_where_dstate(rows: Steps) -> Steps:
-    """The degrees of freedom of each row: three for a dstate, two for a place."""
-    freedom: Steps = 2 + rows[:, 2]
-    return freedom
+class _Course(NamedTuple):
+    """All of a map that displacements are about."""
+
+    labels: tuple[int, ...]
+    places: tuple[int | None, ...]
 
 
-def _parts(size: int) -> Iterator[slice]:
+def _parts(size: int, most: int = AT_A_TIME) -> Iterator[slice]:
     """So many loops in parts that fit into memory."""
-    for start in range(0, size, AT_A_TIME):
-        yield slice(start, start + AT_A_TIME)
+    for start in range(0, size, most):
+        yield slice(start, start + most)

@@ -23,10 +23,11 @@ from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
 
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.star import Openings
 from ssh_abduction.theory.drawing import Ends, can_be_drawn, has_way, is_planar
 from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
-from ssh_abduction.trace import Openings, Trace
+from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory

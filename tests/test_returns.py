@@ -1,0 +1,128 @@
+"""Which returns displacements refuse: the same for a trace that grows as for one that is there at once, and the same with the bounds as without."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from instances import maze
+from strategies import traces
+
+from ssh_abduction import DState, Odometry, SSHMap, Theory, Trace
+from ssh_abduction.theory.evidence import displacement as module
+from ssh_abduction.theory.evidence.displacement import Displacement, Returns
+from ssh_abduction.theory.loops import Loops, Reckoning, chi_squares
+from ssh_abduction.theory.together import Together, joint_squares
+
+
+def seen(trace: Trace, truth: tuple[object, ...], dstates: int = 1000) -> SSHMap:
+    """The true map of a walk in a maze, as far as evidence reads it; or one in which there are only so many dstates, and any further one is taken for one of these."""
+    number: dict[object, int] = {}
+    labels = tuple(number.setdefault(state, len(number)) % dstates for state in truth[: len(trace)])
+    places: dict[object, int] = {}
+    of_dstate = [places.setdefault(state[:2], len(places)) for state in number]  # type: ignore[index]
+    return SSHMap(labels, tuple(DState(i, "", place) for i, place in enumerate(of_dstate[:dstates])), ())
+
+
+def evidence_of(trace: Trace, **choices: object) -> Displacement:
+    return Displacement.of(Theory(displacement="use", returns=64, star="none").replace(**choices))
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.data())
+def test_what_is_known_of_a_trace_grows_with_it(data: st.DataObject) -> None:
+    """Pairs and counts; steps without a displacement are among them, and traces that go on from one prefix in two ways."""
+    trace = data.draw(traces(max_steps=10), label="trace")
+    level = data.draw(st.sampled_from(["topological", "causal"]), label="level")
+    theory = Theory.causal() if level == "causal" else Theory(star="none")
+    evidence = Displacement.of(theory.replace(displacement="use", returns=2, reject=0.3))
+    module._KEPT.clear()
+    sizes = data.draw(st.lists(st.integers(1, len(trace)), min_size=1, max_size=6), label="sizes")
+    for size in [*sizes, len(trace)]:
+        prefix = trace.prefix(size)
+        grown, anew = module._returns(evidence, prefix), Returns(evidence, prefix)
+        assert (grown.pairs, grown.count()) == (anew.pairs, anew.count())
+
+
+def test_the_reckoning_of_a_maze_grows_with_it() -> None:
+    trace = maze(4, 4, steps=60, seed=2, odometry=Odometry()).trace
+    trace = replace(trace, steps=tuple(replace(step, displacement=None) if t in (20, 21) else step for t, step in enumerate(trace)))
+    reckoning = Reckoning(trace.prefix(1))
+    for size in range(2, len(trace) + 1):
+        before, reckoning = reckoning, Reckoning(trace.prefix(size), reckoning)
+    other = replace(trace, steps=(*trace.steps[:-1], replace(trace.steps[-1], displacement=(3.0, 2.0, 1.0))))
+    assert not np.array_equal(Reckoning(other, before).loops(0).poses, reckoning.loops(0).poses)  # and what the first one has stays
+    whole = Reckoning(trace)
+    assert whole.begins[-1] > 20
+    assert np.array_equal(reckoning.begins, whole.begins)
+    for number, bend in enumerate(whole.bends):
+        here, there, anew = reckoning.loops(number), whole.loops(number), Loops.of(trace, bend)
+        for name in ("poses", "part", "moments", "ways"):
+            assert np.allclose(getattr(here, name), getattr(there, name), rtol=1e-12, atol=1e-12)
+            assert np.allclose(getattr(here, name), getattr(anew, name), rtol=1e-12, atol=1e-12)
+
+
+def joint_excess(returns: Returns, rows: np.ndarray, thresholds: dict[int, float]) -> np.ndarray:
+    """By how much the chi-square of each set of two rows is above the threshold, m x m, by all sets for all drifts; 0 or less where it is not refused."""
+    reckoning, excess = returns.reckoning, np.zeros((len(rows), len(rows)))
+    i, j = np.triu_indices(len(rows), 1)
+    shared = np.maximum(rows[i, 0], rows[j, 0]) < np.minimum(rows[i, 1], rows[j, 1])
+    i, j = i[shared], j[shared]
+    most = np.array([thresholds.get(freedom, 0.0) for freedom in range(7)])[4 + rows[i, 2] + rows[j, 2]]
+    least = np.full(len(i), np.inf)
+    for number, unlikely in enumerate(reckoning.unlikely):
+        left = np.flatnonzero(least > 0)  # what one drift explains is not refused
+        squares = joint_squares(reckoning.loops(number), rows[i[left]], rows[j[left]]) + unlikely
+        least[left] = np.minimum(least[left], squares - most[left])
+    excess[i, j] = excess[j, i] = least
+    return excess
+
+
+@pytest.mark.parametrize(("noise", "bend"), [("usual", 0.0), ("steady drift", 0.006), ("white", 0.0)])
+def test_bounds_change_no_answer(noise: str, bend: float) -> None:
+    """With each return in turn as the only new one, and thresholds so low that many sets are refused of which no return is, though the map is true."""
+    refused = only_together = 0
+    for seed in range(2 if noise == "white" else 1):
+        model = Odometry(along=0.04, across=0.005, heading=0.003, position=0.02, angle=0.003, turning=0.0)
+        model = replace(model, bend=0.0, scale=0.0) if noise == "white" else model
+        walk = maze(3, 3, steps=26, seed=seed, odometry=model, bend=bend)
+        trace = walk.trace
+        returns, ssh_map = Returns(evidence_of(trace), trace), seen(trace, walk.truth)
+        rows = returns._returns_of(ssh_map.labels, tuple(s.place for s in ssh_map.dstates))
+        thresholds = {4: 3.0, 5: 4.0, 6: 5.0}
+        expected, together = joint_excess(returns, rows, thresholds), Together(returns.reckoning, thresholds, rows)
+        for new in np.eye(len(rows), dtype=bool):
+            worst, excess = together.worst(new), expected[new][0]
+            assert (worst is None) == (excess.max() <= 0)
+            if worst is not None:
+                best = rows[new][0], rows[int(excess.argmax())]
+                assert {tuple(row) for row in worst} == {tuple(row) for row in best}
+                refused += 1
+                only_together += all(square_alone(returns, row) < 2.5 for row in worst)
+    assert refused > only_together
+    assert only_together or noise == "steady drift"
+
+
+def square_alone(returns: Returns, row: np.ndarray) -> float:
+    """The chi-square of a return alone, for the drift for which that is least."""
+    closings = (returns.reckoning.loops(number).closings(row[:1], row[1:2]) for number in range(len(returns.reckoning.bends)))
+    squares = [chi_squares(*found)[int(row[2])][0] for found in closings]
+    return float(min(square + unlikely for square, unlikely in zip(squares, returns.reckoning.unlikely, strict=True)))
+
+
+def test_only_returns_that_end_later_are_asked_about_once_a_map_was_accepted() -> None:
+    walk = maze(3, 3, steps=60, seed=6, odometry=Odometry(along=0.02))
+    trace = walk.trace
+    evidence = evidence_of(trace, reject=0.3)
+    wrong = seen(trace, walk.truth, 14)
+    module._KEPT.clear()
+    size = next(n for n in range(2, len(trace)) if evidence.refuse(trace.prefix(n + 1), replace(wrong, labels=wrong.labels[: n + 1])))
+    for n in range(2, size + 2):
+        prefix, ssh_map = trace.prefix(n), replace(wrong, labels=wrong.labels[:n])
+        grown = evidence.refuse(prefix, ssh_map, since=n - 1)
+        assert grown == Returns(evidence, prefix).refused_together(ssh_map)
+        assert (grown is None) == (n <= size)
+    assert size > 10
