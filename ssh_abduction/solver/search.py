@@ -237,6 +237,10 @@ class Search:
             self._first = self._first or ssh_map
             yield ssh_map
 
+    def unranked(self) -> Iterator[SSHMap]:
+        """As by iteration, but in the order in which maps are found, and without how well they close."""
+        return self._found()
+
     def _found(self) -> Iterator[SSHMap]:
         """The minimal maps, in the order in which they are found; or the best one known."""
         if self._begun:
