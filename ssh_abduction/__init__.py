@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
     from ssh_abduction.rungs import Rung, ladder
-    from ssh_abduction.solver.result import Bound, Progress, Solution, Status
+    from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
+    from ssh_abduction.solver.sharing import Backbone
     from ssh_abduction.steps.certificate import Certificate
     from ssh_abduction.theory.speedups import Speedups
     from ssh_abduction.theory.theory import Theory
@@ -32,8 +33,9 @@ _HOMES = {  # module: the names that it exports
     "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
     "rungs": ("Rung", "ladder"),
-    "solver.result": ("Bound", "Progress", "Solution", "Status"),
+    "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
+    "solver.sharing": ("Backbone",),
     "steps.certificate": ("Certificate",),
     "theory.speedups": ("Speedups",),
     "theory.theory": ("Theory",),
@@ -42,12 +44,14 @@ _HOMES = {  # module: the names that it exports
 
 __all__ = [
     "Action",
+    "Backbone",
     "Bound",
     "Certificate",
     "Cost",
     "DState",
     "Evaluation",
     "Fit",
+    "Level",
     "MapError",
     "MapEvaluation",
     "Odometry",

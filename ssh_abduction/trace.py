@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -24,11 +23,11 @@ from typing import Any, BinaryIO, Literal, TypeAlias
 from ssh_abduction.errors import TraceError, brief, is_finite, is_whole, is_writable, named
 from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
 from ssh_abduction.odometry import Covariance, Displacement, Odometry, checked_covariance, checked_displacement
+from ssh_abduction.star import SPREAD, Entry, Gateway, Openings, Star, is_four, near_quarter, parse_star
 
 View: TypeAlias = str | int
 Kind: TypeAlias = Literal["travel", "turn"]
 TurnDirection: TypeAlias = Literal["right", "left", "around"]
-Openings: TypeAlias = tuple[bool, bool, bool, bool]
 
 FORMAT, VERSION = "ssh-trace", 1
 # Bytes that a line of a file may have. A step with a panorama of 100,000 numbers fits; a file that has no line ends is refused before it fills the memory.
@@ -36,20 +35,26 @@ LONGEST_LINE = 16 * 2**20
 _KINDS = ("travel", "turn")
 _TURNS = ("right", "left", "around")
 _STEP_FIELDS = ("view", "image", "action", "star", "displacement", "covariance", "truth")
-_ACTION_FIELDS = ("name", "kind", "turn")
+_ACTION_FIELDS = ("name", "kind", "turn", "gateway", "bearing")
+_QUARTERS = (None, "right", "around", "left")
 
 
 @dataclass(frozen=True, slots=True)
 class Action:
     """A sequence of control laws that takes the robot from one distinctive state to another.
 
-    The topological axioms read `kind` and `turn`; the causal axioms read the name alone.
+    The topological axioms read `kind` and `turn`; the causal axioms read the name alone. Of a turn, a star of any number of gateways may be told more:
+
+    gateway  it ends facing this gateway, counted from 1 to the side that it turns to; one that the robot faces before is not counted
+    bearing  degrees that it turns by, clockwise
     """
 
     name: str
     kind: Kind | None = None
     turn: TurnDirection | None = None
     extra: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    gateway: int | None = None
+    bearing: float | None = None
 
     def __post_init__(self) -> None:
         name, kind, turn = self.name, self.kind, self.turn
@@ -61,12 +66,39 @@ class Action:
             raise TraceError(f'action.turn: expected "right", "left" or "around", got {brief(turn)}; choose the nearest')
         if turn is not None and kind != "turn":
             raise TraceError(f'action.kind: expected "turn", as the action has a turn, got {brief(kind)}; set the kind or drop the turn')
+        if self.bearing is not None:
+            turn = self._turn_of_bearing()
+            object.__setattr__(self, "turn", turn)
         if kind == "turn" and turn is None:
             raise TraceError('action.turn: expected "right", "left" or "around" for a turn, got none; say which way it goes')
+        if self.gateway is not None and (not is_whole(self.gateway) or self.gateway < 1 or turn not in ("right", "left")):
+            raise TraceError(
+                f"action.gateway: expected 1 or more, for a turn right or left, got {brief(self.gateway)}; count the gateways to that side"
+            )
+
+    def _turn_of_bearing(self) -> TurnDirection:
+        """Which way a turn by the bearing goes. Raises TraceError."""
+        if self.kind != "turn" or not is_finite(self.bearing):
+            raise TraceError(f"action.bearing: expected degrees clockwise, for a turn, got {brief(self.bearing)}; leave it out elsewhere")
+        assert self.bearing is not None
+        degrees = self.bearing % 360
+        turn: TurnDirection = "around" if abs(degrees - 180) <= SPREAD else "right" if degrees < 180 else "left"
+        if min(degrees, 360 - degrees) <= SPREAD or self.turn not in (None, turn):
+            went = "no turn" if min(degrees, 360 - degrees) <= SPREAD else turn
+            raise TraceError(
+                f"action.bearing: expected degrees of a turn {self.turn or ''}, got {brief(self.bearing)}, which is {went}; mend it"
+            )
+        return turn
+
+    @property
+    def in_quarters(self) -> bool:
+        """Whether all that is said of a turn is that it goes right, left or around, by quarters."""
+        quarter = self.bearing is None or ((slot := near_quarter(self.bearing)) is not None and _QUARTERS[slot] == self.turn)
+        return quarter and self.gateway is None
 
     @staticmethod
     def of(value: Action | str | Mapping[str, Any]) -> Action:
-        """An action from its name, or from an object with `name`, `kind` and `turn`. Raises TraceError."""
+        """An action from its name, or from an object with `name`, `kind`, `turn`, `gateway` and `bearing`. Raises TraceError."""
         if isinstance(value, Action):
             return value
         return _action(value, "action")
@@ -74,7 +106,7 @@ class Action:
     def to_json(self) -> Any:
         if self == STANDARD_ACTIONS.get(self.name, Action(self.name)) and not self.extra:
             return self.name
-        known = {"name": self.name, "kind": self.kind, "turn": self.turn}
+        known = {"name": self.name, "kind": self.kind, "turn": self.turn, "gateway": self.gateway, "bearing": self.bearing}
         return {**{k: v for k, v in known.items() if v is not None}, **self.extra}
 
 
@@ -91,7 +123,7 @@ class Step:
     """What was seen at one moment, and the action taken next (None on the last step of a trace).
 
     view          name or number of the view; None while only an image is there
-    star          the openings ahead, right, back and left as four 0/1, or their bearings in degrees, clockwise from ahead
+    star          the openings ahead, right, back and left as four 0/1, None where not observed; or their bearings in degrees, clockwise from ahead; or Gateways
     displacement  (dx, dy, dtheta) from the last step, in metres and radians, in the frame that the robot had there: x ahead, y left, counterclockwise;
                   that of the first step, which no step comes before, says nothing
     covariance    of the displacement, (3, 3); where it is missing, the trace's odometry tells it
@@ -101,7 +133,7 @@ class Step:
 
     view: View | None = None
     action: Action | None = None
-    star: tuple[float, ...] | None = None
+    star: tuple[Entry, ...] | None = None
     displacement: Displacement | None = None
     covariance: Covariance | None = None
     image: tuple[float, ...] | int | None = None
@@ -112,7 +144,7 @@ class Step:
         if self.view is not None:
             _view(self.view, "view")
         if self.star is not None:
-            _numbers(self.star, "star")
+            parse_star(self.star, "star")
         if self.displacement is not None:
             object.__setattr__(self, "displacement", checked_displacement(self.displacement, "displacement"))
         if self.covariance is not None:
@@ -123,42 +155,46 @@ class Step:
     @staticmethod
     def of(
         view: View,
-        star: Sequence[float] | None = None,
+        star: Sequence[Any] | None = None,
         where: str = "step",
         action: Action | None = None,
         displacement: Sequence[float] | None = None,
         covariance: Sequence[Sequence[float]] | None = None,
     ) -> Step:
         """A step from a view, and perhaps a star and a displacement. Raises TraceError that says where."""
-        seen, openings = _view(view, f"{where}: view"), None if star is None else _star(star, f"{where}: star")
+        seen, openings = _view(view, f"{where}: view"), None if star is None else parse_star(star, f"{where}: star")
         try:
             return Step(seen, action, openings, displacement, covariance)  # type: ignore[arg-type]
         except TraceError as error:
             raise TraceError(f"{where}: {error}") from None
 
     @property
+    def gateways(self) -> Star | None:
+        """The star as gateways with bearings."""
+        return None if self.star is None else Star.of(self.star)
+
+    @property
     def openings(self) -> Openings | None:
-        """The star as (ahead, right, back, left). Each bearing counts as the nearest of these. Raises TraceError where two bearings share one."""
+        """The star as (ahead, right, back, left). Raises TraceError where a gateway is in none of these directions, two share one, or one was not observed."""
         star = self.star
         if star is None:
             return None
-        if _is_quarters(star):
+        if is_four(star) and None not in star:
             return bool(star[0]), bool(star[1]), bool(star[2]), bool(star[3])
-        slots = [math.floor(bearing / 90 + 0.5) % 4 for bearing in star]
-        if len(set(slots)) < len(slots):
+        openings = Star.of(star).openings
+        if openings is None:
             raise TraceError(
-                f"star: expected bearings that fall into different quarters (ahead, right, back, left), "
-                f"got {brief(list(star))}; merge the openings that share a quarter"
+                f"star: expected bearings that fall into different quarters (ahead, right, back, left), each near its middle and observed, "
+                f"got {brief(_star_to_json(star))}; merge the openings that share a quarter, or take star=gateways (--star gateways)"
             )
-        ahead, right, back, left = (k in slots for k in range(4))
-        return ahead, right, back, left
+        return openings
 
     def to_json(self) -> dict[str, Any]:
         known: dict[str, Any] = {
             "view": self.view,
             "image": list(self.image) if isinstance(self.image, tuple) else self.image,
             "action": self.action.to_json() if self.action else None,
-            "star": list(self.star) if self.star is not None else None,
+            "star": _star_to_json(self.star) if self.star is not None else None,
             "displacement": list(self.displacement) if self.displacement is not None else None,
             "covariance": [list(row) for row in self.covariance] if self.covariance is not None else None,
             "truth": self.truth,
@@ -225,6 +261,12 @@ class Trace:
         """Whether any step carries a star."""
         return any(step.star is not None for step in self.steps)
 
+    @cached_property
+    def in_quarters(self) -> bool:
+        """Whether all stars and turns fit right angles: then a star is four openings."""
+        stars = {tuple(step.star) for step in self.steps if step.star is not None}
+        return all(Star.of(star).openings is not None for star in stars) and all(action.in_quarters for action in set(self.actions))
+
     @property
     def has_displacements(self) -> bool:
         """Whether any step carries a displacement."""
@@ -247,7 +289,7 @@ class Trace:
         views: Iterable[View],
         actions: Iterable[Action | str | Mapping[str, Any]],
         *,
-        stars: Iterable[Sequence[float] | None] | None = None,
+        stars: Iterable[Sequence[Any] | None] | None = None,
         displacements: Iterable[Sequence[float] | None] | None = None,
         covariances: Iterable[Sequence[Sequence[float]] | None] | None = None,
         odometry: Odometry | Mapping[str, Any] | None = None,
@@ -456,7 +498,7 @@ def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> 
         action = _action(raw, f"{where}: action")
         if not action.extra:
             action = actions.setdefault(action.name, action) if actions.get(action.name, action) == action else action
-    star = _star(record["star"], f"{where}: star") if record.get("star") is not None else None
+    star = parse_star(record["star"], f"{where}: star") if record.get("star") is not None else None
     extra = {k: v for k, v in record.items() if k not in _STEP_FIELDS}
     try:
         return Step(view, action, star, record.get("displacement"), record.get("covariance"), image, record.get("truth"), extra)
@@ -499,14 +541,15 @@ def _action(value: Any, where: str) -> Action:
         value = {"name": value}
     if not isinstance(value, Mapping):
         raise TraceError(f'{where}: expected a name or {{"name": …, "kind": …}}, got {brief(value)}; name the action')
-    name, kind, turn = (value.get(key) for key in _ACTION_FIELDS)
+    name, kind, turn, gateway, bearing = (value.get(key) for key in _ACTION_FIELDS)
     standard = STANDARD_ACTIONS.get(name) if isinstance(name, str) else None
-    if kind is None and turn is None and standard is not None:
+    if kind is None and turn is None and gateway is None and bearing is None and standard is not None:
         kind, turn = standard.kind, standard.turn
-    if kind == "turn" and turn is None and name in _TURNS:
+    if kind == "turn" and turn is None and bearing is None and name in _TURNS:
         turn = name
     try:
-        return Action(name, kind, turn, {k: v for k, v in value.items() if k not in _ACTION_FIELDS})  # type: ignore[arg-type]
+        extra = {k: v for k, v in value.items() if k not in _ACTION_FIELDS}
+        return Action(name, kind, turn, extra, gateway, bearing)  # type: ignore[arg-type]
     except TraceError as error:  # the message of the action names the field, and the file and line are put before it
         raise TraceError(f"{where.removesuffix('action')}{error}") from None
 
@@ -528,19 +571,5 @@ def _image(value: Any, where: str) -> tuple[float, ...] | int:
     return tuple(_numbers(value, where))
 
 
-def _star(value: Any, where: str) -> tuple[float, ...]:
-    if hasattr(value, "tolist"):
-        value = value.tolist()  # numpy's
-    if isinstance(value, list | tuple):
-        value = [int(x) if isinstance(x, bool) else x for x in value]
-    star = tuple(_numbers(value, where))
-    if not _is_quarters(star) and len({bearing % 360 for bearing in star}) < len(star):
-        raise TraceError(
-            f"{where}: expected four 0/1 (openings ahead, right, back, left) or different bearings in degrees, got {brief(list(star))}; mend it"
-        )
-    return star
-
-
-def _is_quarters(star: tuple[float, ...]) -> bool:
-    """Whether a star is four 0/1, which are openings and not bearings: as bearings at least two of them would be equal."""
-    return len(star) == 4 and all(x in (0, 1) for x in star)
+def _star_to_json(star: Sequence[Entry]) -> list[Any]:
+    return [entry.to_json() if isinstance(entry, Gateway) else entry for entry in star]

@@ -15,16 +15,17 @@ topological theory also needs the kinds of the actions. `one_place` and `one_cou
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from itertools import combinations, product
+from itertools import combinations, permutations, product
 from typing import NamedTuple, TypeAlias
 
 from brute_geometry import Geometry
 
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.star import Gateway, Openings, Star
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Action, Openings, Trace
+from ssh_abduction.trace import Action, Step, Trace
 
 Labels: TypeAlias = tuple[int, ...]
 Places: TypeAlias = tuple[int | None, ...]
@@ -35,6 +36,7 @@ Link: TypeAlias = tuple[int, Action, int]
 Order: TypeAlias = frozenset[tuple[int, int]]  # (p, q): p comes before q in direction +1
 Branch: TypeAlias = tuple[int, int, int, int, int]  # (p, h, d, h', d'): at p, (h', d') leaves to the right of (h, d)
 Axioms: TypeAlias = frozenset[str]
+Named: TypeAlias = tuple[int, int, int]  # a gateway: its number in the star, its bearing and its spread, in whole degrees
 
 SLOTS = (0, 1, 2, 3)
 QUARTERS = {"right": 1, "around": 2, "left": 3}
@@ -89,12 +91,36 @@ def minimal_maps(trace: Trace, theory: Theory, allows: Callable[[Key], bool] = l
     return counts, keys
 
 
+def near_minimal_maps(
+    trace: Trace, theory: Theory, within: int, allows: Callable[[Key], bool] = lambda _: True
+) -> dict[tuple[int, ...], set[Key]]:
+    """By their cost: the maps that come first by `theory.priorities` among those with one number of dstates, in the order of these numbers.
+
+    within  how much greater that number may be than in minimal maps
+
+    Where the theory prefers few paths or places first, these are counted instead of dstates; where it prefers none of these, all maps have one number.
+    """
+    counted = next((name for name in theory.priorities if name != "excuses"), None)
+    best: dict[int, tuple[tuple[int, ...], set[Key]]] = {}  # by that number
+    for found, its_counts in consistent_maps(trace, theory):
+        if allows(found):
+            cost = tuple(getattr(its_counts, name) for name in theory.priorities)
+            number = getattr(its_counts, counted) if counted else 0
+            known = best.setdefault(number, (cost, set()))
+            if cost < known[0]:
+                best[number] = known = cost, set()
+            if cost == known[0]:
+                known[1].add(found)
+    least = min(((cost, number) for number, (cost, _) in best.items()), default=((), 0))[1]
+    return {cost: keys for number, (cost, keys) in sorted(best.items()) if least <= number <= least + within}
+
+
 def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]]:
     """Every map that satisfies the axioms, once, with its counts: excuses are the fewest that make it consistent."""
     theory = theory.resolve(trace)
     on = frozenset(theory.axioms)
     defeasible = theory.boundary == "defeasible"
-    stars = tuple(step.openings for step in trace)
+    stars = tuple(step.openings if theory.star in ("pattern", "frame") else None for step in trace)
     geometry = Geometry(trace, theory) if "one_pose" in on else None
     for labels in _labellings(trace, on):
         if "asserted" in on and not _as_asserted(labels, None, theory):
@@ -114,8 +140,12 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
             headings = list(_headings(labels, places, trace.actions, stars, on)) if theory.star == "frame" else []
             if theory.star == "frame" and not headings:
                 continue
+            if "planar" in on and not _is_planar(labels, places, links, headings, theory):
+                continue
             for courses in _courses(places, links, on):
                 if headings and not any(_goes_straight(labels, places, courses, h, on) for h in headings):
+                    continue
+                if theory.star == "gateways" and not _gateways_agree(trace, labels, places, courses, on):
                     continue
                 excuses = _least_excuses(places, courses, links, on, defeasible)
                 if excuses is not None:
@@ -256,6 +286,116 @@ def _goes_straight(labels: Labels, places: tuple[int, ...], courses: Courses, he
                 through[places[label], slot].add(leaving)
                 slots[places[label], leaving].add(slot)
     return all(len(x) == 1 for x in through.values()) and all(len(x) == 1 for x in slots.values())
+
+
+# --- gateways: places with any number of them, in any directions, by trying every rotation
+
+
+def _gateways_agree(trace: Trace, labels: Labels, places: tuple[int, ...], courses: Courses, on: Axioms) -> bool:
+    """Whether at each place the gateways of all steps can be named, so that stars agree when turned by whole degrees."""
+    at = [places[label] for label in labels]
+    return all(_named([t for t in range(len(labels)) if at[t] == place], trace, labels, courses, on) for place in set(at))
+
+
+def _named(steps: list[int], trace: Trace, labels: Labels, courses: Courses, on: Axioms) -> bool:
+    """Whether each of these steps, which are at one place, has a reading of its star: the bearing of each gateway of the place, in a clockwise order that is the same for all."""
+
+    def extend(chosen: dict[int, tuple[Named, ...]]) -> bool:
+        if len(chosen) == len(steps):
+            return True
+        step = steps[len(chosen)]
+        for reading in _readings(trace.steps[step]):
+            for k in range(max(len(reading), 1)) if chosen else (0,):
+                turned = reading[k:] + reading[:k]
+                if all(_agree(i, before, step, turned, trace, labels, courses, on) for i, before in chosen.items()) and extend(
+                    {**chosen, step: turned}
+                ):
+                    return True
+        return False
+
+    return extend({})
+
+
+def _readings(step: Step) -> list[tuple[Named, ...]]:
+    """The gateways (number in the star, bearing, spread) from ahead clockwise, with or without each that was not observed."""
+    star = step.gateways
+    gateways = star.gateways if star else ()
+    found = []
+    for seen in product(*[(True,) if g.open else (True, False) for g in gateways]):
+        kept = [(k, round(g.bearing) % 360, round(g.spread)) for k, (g, there) in enumerate(zip(gateways, seen, strict=True)) if there]
+        found.append(tuple(sorted(kept, key=lambda g: (gateways[g[0]].bearing + gateways[g[0]].spread) % 360)))
+    return found
+
+
+def _off(a: float, b: float) -> float:
+    return abs((a - b + 180) % 360 - 180)
+
+
+def _agree(
+    i: int, seen_i: tuple[Named, ...], t: int, seen_t: tuple[Named, ...], trace: Trace, labels: Labels, courses: Courses, on: Axioms
+) -> bool:
+    """Whether steps i < t at one place may see so."""
+    stars = [Star.of(trace.steps[step].star or ()).gateways for step in (i, t)]
+    rotations: set[int] = set()
+    if len(seen_i) == len(seen_t):
+        rotations = {r for r in range(360) if all(_off(b, c + r) <= d + e for (_, b, d), (_, c, e) in zip(seen_i, seen_t, strict=True))}
+        pairs = {(a[0], b[0]) for a, b in zip(seen_i, seen_t, strict=True)}
+        for j, k in pairs:
+            there = [(stars[0][j].opposite, stars[1][k].opposite)]
+            known = [(a, b) for a, b in there if a in {p for p, _ in pairs} and b in {q for _, q in pairs}]
+            if any(pair not in pairs for pair in known):
+                rotations = set()
+    if "gateway_frame" in on and not rotations:
+        return False
+    if "gateway_turn" in on and t == i + 1 and trace.actions[i].kind == "turn" and not rotations & _turn(trace.actions[i], seen_i):
+        return False
+    facing = {}
+    for way, degrees in (("same", 0), ("reverse", 180)):
+        ways = [_way_on(seen, star) for seen, star in zip((seen_i, seen_t), stars, strict=True)]
+        declared = False
+        if rotations and ways[0] and ways[1]:
+            now = ways[1][0] if way == "same" else ways[1][1]
+            declared = (ways[0][0], now) in pairs and (way == "same" or (ways[0][0], ways[1][0]) not in pairs)
+        facing[way] = degrees in rotations or declared, (degrees in rotations and not rotations & {90, 270}) or declared
+    one = labels[i] == labels[t]
+    if "gateway_heading" in on and one:
+        if not facing["same"][0]:
+            return False
+        if stars[0] == stars[1] and seen_i != seen_t:
+            return False
+    if "gateway_dstate" in on and facing["same"][1] and not one:
+        return False
+    a, b = courses[labels[i]], courses[labels[t]]
+    if "gateway_path" not in on or a is None or b is None:
+        return True
+    same, reverse = a == b, b == (a[0], -a[1])
+    must = (same or not facing["same"][1]) and (reverse or not facing["reverse"][1])
+    return must and (facing["same"][0] or not same) and (facing["reverse"][0] or not reverse)
+
+
+def _turn(action: Action, seen: tuple[Named, ...]) -> set[int]:
+    """The rotations that a turn may be."""
+    if action.bearing is not None:
+        return {r for r in range(360) if _off(r, round(action.bearing)) <= 10}
+    if action.gateway is not None:
+        beside = sorted((b, d) for _, b, d in seen if _off(b, 0) > d)
+        if action.turn == "left":
+            beside.reverse()
+        if action.gateway > len(beside):
+            return set()
+        bearing, spread = beside[action.gateway - 1]
+        return {r for r in range(360) if _off(r, bearing) <= spread}
+    return {"around": {180}, "right": set(range(21, 160)), "left": set(range(201, 340))}[str(action.turn)]
+
+
+def _way_on(seen: tuple[Named, ...], star: tuple[Gateway, ...]) -> tuple[int, int] | None:
+    """The gateways ahead and behind, by their numbers in the star, where a path bends through gateways that are declared opposite."""
+    by_number = {k: (b, d) for k, b, d in seen}
+    for k, bearing, spread in sorted(seen, key=lambda g: (star[g[0]].bearing + star[g[0]].spread) % 360):
+        other = star[k].opposite
+        if other in by_number and (_off(bearing, 0) <= spread or _off(by_number[other][0], 180) <= by_number[other][1]):
+            return k, other
+    return None
 
 
 # --- courses: which dstates are along which path, and which way
@@ -409,3 +549,95 @@ def _sides_allowed(
         if "path_between_sides" in on and q in on_path[h]:
             return False
     return True
+
+
+# --- planarity: whether some orders of the edges around the places make a drawing without crossings
+
+Edge: TypeAlias = frozenset[
+    tuple[int, object]
+]  # the gateways at its ends: a place, and a slot or an arm; one where it comes back to its gateway
+
+
+def _is_planar(labels: Labels, places: tuple[int, ...], links: frozenset[Link], headings: list[tuple[int, ...]], theory: Theory) -> bool:
+    """Whether the edges that travels lead along can be drawn. By headings where places have frames; if not, by sides."""
+    travels = {(s, t) for s, action, t in links if action.kind == "travel"}
+    if theory.star == "frame":
+        for heading in headings:
+            facing = dict(zip(labels, heading, strict=True))
+            edges = {frozenset({(places[s], facing[s]), (places[t], (facing[t] + 2) % 4)}) for s, t in travels}
+            if _is_drawing(edges, dict.fromkeys(places, SLOTS)):
+                return True
+        return False
+    supported = _supported(frozenset(link for link in links if link[1].kind == "travel" or places[link[0]] == places[link[2]]))
+    arms = {(s, side): (s, side) for s in supported for side in (1, -1)}
+
+    def merge(one: tuple[int, int], other: tuple[int, int]) -> None:
+        """Say that two arms are one, and so those opposite to them."""
+        for turned in (1, -1):
+            old, new = arms[one[0], turned * one[1]], arms[other[0], turned * other[1]]
+            arms.update({arm: new for arm, of in arms.items() if of == old})
+
+    for s, action, t in links:
+        if action.turn == "around" and s in supported and places[s] == places[t]:
+            merge((s, 1), (t, -1))
+    beyond = [pair for s, t in travels for pair in (((s, 1), (t, -1)), ((t, -1), (s, 1)))]
+    for _ in arms:  # gateways to which one gateway leads are one, again and again
+        for (one, other), (here, there) in product(beyond, repeat=2):
+            if arms[one] == arms[here]:
+                if places[other[0]] != places[there[0]]:
+                    return False
+                merge(other, there)
+    edges = {frozenset({(places[s], arms[s, 1]), (places[t], arms[t, -1])}) for s, t in travels}
+    rounds: list[set[tuple[object, ...]]] = []
+    for p in sorted(set(places)):
+        told: list[list[tuple[int, int]]] = []  # arms one after another, clockwise
+        for s, action, t in links:
+            if action.turn in ("right", "left") and places[s] == places[t] == p and {s, t} <= supported:
+                right, left = ((t, 1), (t, -1)) if action.turn == "right" else ((t, -1), (t, 1))
+                ends = [(s, 1), right, (s, -1), left]
+                told.append([arms[end] for end in ends if theory.symmetric_sides or end != (t, -1)])
+        here = sorted({arms[s, side] for s in supported if places[s] == p for side in (1, -1)})
+        used = {arm for edge in edges for q, arm in edge if q == p}
+        good = [order for order in permutations(here) if order[:1] == tuple(here[:1]) and all(_clockwise(order, ends) for ends in told)]
+        rounds.append({tuple(arm for arm in order if arm in used) for order in good})
+    return any(_is_drawing(edges, dict(zip(sorted(set(places)), choice, strict=True))) for choice in product(*rounds))
+
+
+def _clockwise(order: tuple[object, ...], ends: list[tuple[int, int]]) -> bool:
+    """Whether these arms, which have to be different ones, come one after another going round once."""
+    start = order.index(ends[0])
+    turned = [(order.index(end) - start) % len(order) for end in ends]
+    return len(set(turned)) == len(ends) and turned == sorted(turned)
+
+
+def _is_drawing(edges: set[Edge], rounds: dict[int, tuple[object, ...]]) -> bool:
+    """Whether each gateway has one edge, and V - E + F = 2 for each connected part.
+
+    rounds  the gateways around each place, clockwise
+    """
+    numbered = [sorted(edge, key=repr) for edge in edges]
+    ends = {(i, k): edge[k % len(edge)] for i, edge in enumerate(numbered) for k in (0, 1)}
+    if any(edges_there > 1 for edges_there in Counter(gateway for edge in edges for gateway in edge).values()):
+        return False
+    places = {p for p, _ in ends.values()}
+    after: dict[tuple[int, int], tuple[int, int]] = {}
+    for p in places:
+        around = [end for g in rounds[p] for end in ends if ends[end] == (p, g)]
+        after.update(zip(around, around[1:] + around[:1], strict=True))
+    assert set(after) == set(ends)
+    faces = _orbits({end: after[end[0], 1 - end[1]] for end in ends})
+    part = {p: p for p in places}
+    for i in range(len(numbered)):
+        one, other = part[ends[i, 0][0]], part[ends[i, 1][0]]
+        part = {p: other if q == one else q for p, q in part.items()}
+    return len(places) - len(numbered) + faces == 2 * len(set(part.values()))
+
+
+def _orbits(following: dict[tuple[int, int], tuple[int, int]]) -> int:
+    orbits = set()
+    for end in following:
+        orbit = [end]
+        while following[orbit[-1]] != end:
+            orbit.append(following[orbit[-1]])
+        orbits.add(frozenset(orbit))
+    return len(orbits)

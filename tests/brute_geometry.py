@@ -121,5 +121,7 @@ class Geometry:
         returns = [(i, j, 3) for i, j in combinations(range(len(labels)), 2) if labels[i] == labels[j]]
         if places is not None:
             returns += [(i, j, 2) for i, j in combinations(self.arrivals, 2) if places[labels[i]] == places[labels[j]]]
-        sets = [c for size in range(1, self.theory.joint + 1) for c in combinations(sorted(returns), size)]
-        return not any(map(self.refuses, sets))
+        alone = [(one,) for one in returns]
+        arrived = sorted(one for one in returns if one[0] in self.arrivals and one[1] in self.arrivals)
+        together = list(combinations(arrived, 2)) if self.theory.joint > 1 else []
+        return not any(map(self.refuses, [*alone, *together]))

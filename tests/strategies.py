@@ -123,6 +123,7 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "path_order": st.sampled_from(["partial", "total"]),
         "next_place": st.booleans(),
         "all_on_paths": st.booleans(),
+        "planar": st.booleans(),
         "star": st.sampled_from(["auto", "none", "pattern", "frame"] if trace.has_stars else ["auto", "none"]),
         "displacement": st.sampled_from(["auto", "none", "use"] if trace.has_displacements else ["auto", "none"]),
         "reject": st.sampled_from([0.001, 0.3]),

@@ -17,10 +17,11 @@ NO_SIDES = PLAIN.replace(boundary="none")
 NEXT = NO_SIDES.replace(next_place=True)
 ON_PATHS = PLAIN.replace(all_on_paths=True)
 FRAME = PLAIN.replace(star="frame")
+GATEWAYS = PLAIN.replace(star="gateways")
 NONE = None  # no map
 Answer = tuple[tuple[int, int, int] | None, int]
 
-# axiom: theory, trace, openings at each step, the counts and the number of minimal maps with the axiom, and without it
+# axiom: theory, trace, openings or bearings at each step, the counts and the number of minimal maps with the axiom, and without it
 CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
     "functional_view": (PLAIN, "b L a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "deterministic": (PLAIN, "a R a R b R a", "", ((3, 1, 0), 2), ((2, 1, 0), 1)),
@@ -50,7 +51,19 @@ CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
     "one_heading": (FRAME, "c R c", "ahead left", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "turn_rotates": (FRAME, "b L a", "ahead back", (NONE, 0), ((2, 1, 0), 1)),
     "one_dstate_per_heading": (FRAME, "a R b L c", "ahead left ahead", (NONE, 0), ((3, 1, 0), 1)),
+    "planar": (PLAIN.replace(planar=True), "a T a T a A a T a", "", ((5, 3, 1), 1), ((5, 3, 1), 2)),
     "asserted": (PLAIN.replace(different=[(0, 2)]), "a R a R a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
+    "gateway_frame": (
+        GATEWAYS,
+        "a T b R c T d R e T f",
+        "0+60 180+120 0+60 180+120 0+60 180",
+        ((6, 4, 3), 1),
+        ((6, 3, 3), 1),
+    ),
+    "gateway_heading": (GATEWAYS, "a R a", "0+120 0+240", ((2, 1, 0), 1), ((1, 1, 0), 1)),
+    "gateway_turn": (GATEWAYS, "b A a", "0 120", (NONE, 0), ((2, 1, 0), 1)),
+    "gateway_dstate": (GATEWAYS, "a R b L c", "0+120 0+240 0+120", (NONE, 0), ((3, 1, 0), 1)),
+    "gateway_path": (GATEWAYS, "a T a A a T a", "180 120 300 300", ((4, 3, 1), 1), ((4, 2, 1), 1)),
     "one_pose": (PLAIN, "a R a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "path_goes_straight": (FRAME, "a T a A a T a", "back right left left", ((4, 3, 1), 1), ((4, 2, 1), 1)),
 }
@@ -61,8 +74,11 @@ MOVED = {"one_pose": [(0.0, 0.0, -math.pi / 2)]}  # the displacements that an ax
 def trace_of(text: str, openings: str, moved: list[tuple[float, float, float]] | None = None) -> Trace:
     words = text.split()
     sides = ("ahead", "right", "back", "left")
-    stars = [[side in seen.split("+") for side in sides] for seen in openings.split()] if openings else None
-    return Trace.from_steps(words[0::2], [ACTIONS[a] for a in words[1::2]], stars=stars, displacements=moved)
+    stars: list[list[float]] = []
+    for seen in openings.split():
+        words_seen = seen.split("+")
+        stars.append([float(word) for word in words_seen] if words_seen[0].isdigit() else [side in words_seen for side in sides])
+    return Trace.from_steps(words[0::2], [ACTIONS[a] for a in words[1::2]], stars=stars or None, displacements=moved)
 
 
 def answer(trace: Trace, theory: Theory) -> Answer:
@@ -95,5 +111,6 @@ def test_an_axiom_has_a_sentence_and_a_source(axiom: Any) -> None:
 def test_every_violation_in_the_encodings_belongs_to_an_axiom(level: str) -> None:
     text = (encodings.folder() / f"{level}.lp").read_text()
     names = {axiom.name for axiom in encodings.axioms() if axiom.level == level}
-    assert set(re.findall(r"violation\((\w+),t\) :-", text)) - {"N"} == names
+    found_of_maps = {"planar"}  # what evidence refuses once there is a map has no rule
+    assert set(re.findall(r"violation\((\w+),t\) :-", text)) - {"N"} == names - found_of_maps
     assert set(re.findall(r"% @axiom\((\w+)\)", text)) == names

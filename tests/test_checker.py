@@ -20,6 +20,7 @@ ACTIONS = {"T": "travel", "R": "right", "L": "left", "A": "around"}
 ALL_OPEN = (1, 1, 1, 1)
 TOPOLOGICAL = Theory.topological()
 NO_SIDES = TOPOLOGICAL.replace(boundary="none")
+GATEWAYS = TOPOLOGICAL.replace(star="gateways")
 ONE_SIDE = TOPOLOGICAL.replace(symmetric_sides=False)
 
 
@@ -121,6 +122,8 @@ SPUN = replace(seen("a R a"), steps=tuple(replace(s, displacement=(0, 0, -1.5) i
 BROKEN = {
     "one_pose": case(TOPOLOGICAL, SPUN, "0 0", "0"),
     "asserted": case(TOPOLOGICAL.replace(different=[(0, 2)]), seen("a R a R a"), "0 0 0", "0"),
+    # After turning back, past the place before.
+    "planar": case(TOPOLOGICAL.replace(planar=True), seen("a T b T c A d T e"), "0 1 2 3 4", "0:0+ 1:0+ 2:0+ 2:0- 0:0-", "012"),
     "functional_view": case(TOPOLOGICAL, seen("a R b"), "0 0", "0"),
     "deterministic": case(TOPOLOGICAL, seen("a R b R a R c"), "0 1 0 2", "0 0 0"),
     "one_place": case(TOPOLOGICAL, seen("a"), "0", "."),
@@ -168,6 +171,25 @@ BROKEN = {
     # Two right turns, but the way back is taken for another path.
     "path_goes_straight": case(
         TOPOLOGICAL, seen("a T b R c R d T e", [ALL_OPEN] * 5), "0 1 2 3 4", "0:0+^0 1:0+^0 1^1 1:1+^2 2:1+^0", "01 12"
+    ),
+    # Round a triangle: place 0 has a gateway less when it is seen again.
+    "gateway_frame": case(
+        GATEWAYS,
+        seen("a T b R c T d R e T f", [(0, 60), (180, 120), (0, 60), (180, 120), (0, 60), (180,)]),
+        "0 1 2 3 4 5",
+        "0:0+^0 1:0+^0 1:1+^120 2:1+^0 2:2+^120 0:2+^240",
+        "01 12 20",
+    ),
+    "gateway_heading": case(GATEWAYS, seen("a", [(0, 120)]), "0", "0"),
+    "gateway_turn": case(GATEWAYS, seen("a L b", [(0, 120), (0, 240)]), "0 1", "0^0 0^120"),
+    "gateway_dstate": case(GATEWAYS, seen("a R b L c", [(0, 120), (0, 240), (0, 120)]), "0 1 2", "0^0 0^120 0^0", also="gateway_frame"),
+    "gateway_path": case(
+        GATEWAYS,
+        seen("a T b R c R d T e", [(0,), (70, 180), (0, 110), (0, 250), (180,)]),
+        "0 1 2 3 4",
+        "0:0+^0 1:0+^0 1^70 1:1+^180 2:1+^0",
+        "01 12",
+        also="gateway_frame",
     ),
 }
 HIDDEN = ("branch_side", "symmetric_sides", "side_of_branch", "order_asymmetric", "order_transitive")
@@ -348,6 +370,7 @@ THEORIES = st.builds(
     path_order=st.sampled_from(["partial", "total"]),
     next_place=st.booleans(),
     all_on_paths=st.booleans(),
+    planar=st.booleans(),
     without=st.lists(st.sampled_from(AXIOM_NAMES), unique=True, max_size=4).map(tuple),
 )
 GROUNDS = [*CORRECT.values(), *BROKEN.values()]

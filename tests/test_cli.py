@@ -77,7 +77,17 @@ def test_all_maps_and_a_few(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 def test_every_field_of_a_theory_is_a_flag(capsys: pytest.CaptureFixture[str]) -> None:
     flags = [
-        *("--theory", "circumscriptive", "--boundary", "defeasible", "--no-symmetric-sides", "--path-order", "partial", "--next-place"),
+        *(
+            "--theory",
+            "circumscriptive",
+            "--boundary",
+            "defeasible",
+            "--no-symmetric-sides",
+            "--path-order",
+            "partial",
+            "--next-place",
+            "--planar",
+        ),
         *("--no-all-on-paths", "--star", "pattern", "--prefer", "places,excuses", "--without", "on_path", "--level", "topological"),
         *("--displacement", "none", "--reject", "0.01", "--joint", "1"),
     ]
@@ -87,6 +97,7 @@ def test_every_field_of_a_theory_is_a_flag(capsys: pytest.CaptureFixture[str]) -
         symmetric_sides=False,
         path_order="partial",
         next_place=True,
+        planar=True,
         star="pattern",
         prefer=("places", "excuses"),
         without=("on_path",),

@@ -129,8 +129,8 @@ def test_a_mapper_says_how_far_it_is() -> None:
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(st.data())
 def test_sketches_are_consistent(data: st.DataObject) -> None:
-    trace = data.draw(traces(max_steps=14), label="trace")
-    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS)), label="theory").resolve(trace)
+    trace = data.draw(traces(max_steps=14), label="trace").without_displacements()  # what evidence says, a sketch does not know
+    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory").resolve(trace)
     sketch = data.draw(st.sampled_from(Sketch.all_of(trace.steps[0], theory)), label="sketch")
     for i, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True)):
         assert check(trace.prefix(i + 1), sketch.map(), theory) == ()
@@ -163,8 +163,8 @@ def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.data())
 def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> None:
-    trace = data.draw(traces(max_steps=10), label="trace")
-    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS)), label="theory").resolve(trace)
+    trace = data.draw(traces(max_steps=10), label="trace").without_displacements()  # what evidence says, a sketch does not know
+    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory").resolve(trace)
     draft(trace, theory, data.draw(st.integers(1, len(trace)), label="known"), data.draw(st.integers(0, 4), label="which"))
 
 
@@ -358,7 +358,7 @@ def test_a_displacement_that_is_none_changes_nothing(given: dict[str, Any], mess
 
 
 @pytest.mark.parametrize(
-    ("theory", "stars", "steps"), [(Theory(), True, 40), (Theory(), False, 18), (Theory.causal(), False, 40), (Theory(joint=1), True, 30)]
+    ("theory", "stars", "steps"), [(Theory(), True, 30), (Theory(), False, 16), (Theory.causal(), False, 24), (Theory(joint=1), True, 24)]
 )
 def test_the_trace_settles_displacements_as_it_grows(theory: Theory, stars: bool, steps: int) -> None:
     """The first displacement comes late, and one is missing; the number of returns that may be true doubles several times."""
@@ -366,8 +366,8 @@ def test_the_trace_settles_displacements_as_it_grows(theory: Theory, stars: bool
     missing = {1, 2, 3, steps // 2}
     trace = replace(trace, steps=tuple(replace(step, displacement=None) if t in missing else step for t, step in enumerate(trace)))
     _, answers = follow(trace, theory)
-    for i, answer in enumerate(answers):
-        anew = solve(trace.prefix(i + 1), theory, maps=0)
+    for i in (0, 3, 4, *range(5, steps + 1, 3)):
+        answer, anew = answers[i], solve(trace.prefix(i + 1), theory, maps=0)
         assert (answer.theory, answer.status, answer.complete, answer.bound) == (anew.theory, anew.status, True, anew.bound)
         assert set(answer.maps) == set(anew.maps)
         assert {name: said["pairs"] for name, said in answer.evidence.items()} == {
@@ -391,7 +391,7 @@ def test_displacements_may_be_asked_for_before_the_first_one_comes() -> None:
 
 def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
     """Without time for clingo, all maps are guessed or sketched, and displacements refuse none of them: not even those of steps before the threshold changed."""
-    trace = maze(4, 4, steps=150, seed=1, stars=True, odometry=Odometry(along=0.02)).trace
+    trace = maze(4, 4, steps=80, seed=1, stars=True, odometry=Odometry(along=0.02)).trace
     given: list[Trace] = []
 
     def guessed_map(trace: Trace, *others: Any) -> SSHMap | None:
@@ -404,13 +404,13 @@ def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
     with (
         patch.object(guessing, "has_processors", lambda _: True),
         patch.object(guessing, "in_process", at_once),
-        patch.object(online, "GUESSED", 100),
+        patch.object(online, "GUESSED", 50),
     ):
         mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, odometry=trace.odometry, limit=NO_TIME)
         for action, step in zip(trace.actions, trace.steps[1:], strict=True):
             answer = observed(mapper, action, step)
             assert answer.status is Status.FEASIBLE
-            if answer.steps % 10 == 0:
+            if answer.steps % 10 == 1:
                 assert check(trace.prefix(answer.steps), answer.maps[0], mapper.theory) == ()
             if mapper._guess:
                 mapper._guess.map()

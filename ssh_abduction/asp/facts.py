@@ -15,11 +15,12 @@ from typing import TypeAlias
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 
 from ssh_abduction.maps import DState, Path, SSHMap
+from ssh_abduction.steps import frames
 from ssh_abduction.steps.chart import Chart, FramedChart
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality, evidence_of
 from ssh_abduction.theory.speedups import TRAVELS_AND_TURNS
-from ssh_abduction.theory.theory import Theory
+from ssh_abduction.theory.theory import Count, Theory
 from ssh_abduction.trace import Action, Trace
 
 _COURSE = {"pos": 1, "neg": -1}
@@ -76,7 +77,28 @@ def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
     facts += [f"act({t},{_constant(action.name)})." for t, action in done.items()]
     if theory.level == "topological":
         facts += [_kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None]
+    if theory.star == "gateways":
+        facts += _gateway_facts(trace, start, stop)
     return "\n".join([*facts, *_evidence_facts(trace, theory, start, stop)])
+
+
+def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
+    """What these steps see of gateways, and how that fits what earlier steps see, as facts for gateways.lp."""
+    found = frames.Frames(trace, stop)
+    known = len(frames.Frames(trace, start).frames)
+    yield from (f"star({t},{found.stars[t]})." for t in range(start, stop))
+    yield from (f"looks({star},{x})." for star in dict.fromkeys(found.stars[start:]) for x in found.looks[star])
+    yield from (f"slots({x},{max(frame.slots, 1)})." for x, frame in enumerate(found.frames) if x >= known)
+    for x, y in product(range(len(found.frames)), repeat=2):
+        for shift in found.fits(x, y) if max(x, y) >= known else ():
+            yield f"fits({x},{y},{shift})."
+            yield from (f"may({x},{y},{shift},{way})." for way in frames.may_face(found.frames[x], found.frames[y], shift))
+            yield from (f"must({x},{y},{shift},{way})." for way in frames.must_face(found.frames[x], found.frames[y], shift))
+    turns = {(trace.actions[t - 1], found.stars[t - 1], found.stars[t]): None for t in range(max(start, 1), stop)}
+    for action, a, b in turns:
+        for x, y in product(found.looks[a], found.looks[b]) if action.turn else ():
+            fitting = (c for c in found.fits(x, y) if frames.may_turn(action, found.frames[x], found.frames[y], c))
+            yield from (f"rotates({_constant(action.name)},{x},{y},{shift})." for shift in fitting)
 
 
 def _evidence_facts(trace: Trace, theory: Theory, start: int, stop: int) -> Iterator[str]:
@@ -136,6 +158,7 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
     place: dict[int, int] = {}
     course: dict[int, tuple[int, int]] = {}
     heading: dict[int, int] = {}
+    shape: dict[int, int] = {}
     before: list[tuple[int, int, int]] = []
     excused: list[tuple[int, int]] = []
     for name, args in map(_atom, model.symbols(shown=True)):
@@ -149,8 +172,13 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
             before.append((args[0], args[1], args[2]))
         elif name == "heading":
             heading[args[0]] = args[1]
+        elif name == "shape":
+            shape[args[0]] = args[1]
         elif name == "excused":
             excused.append((args[0], args[1]))
+    if theory.star == "gateways":
+        found = frames.Frames(trace, len(is_at)).frames
+        heading = {t: frames.heading(found[shape[p]], found[shape[t]], heading[t]) for t, p in place.items()}
     return _map(trace, is_at, place, course, heading, before, excused)
 
 
@@ -381,8 +409,54 @@ def forbidden_places(equalities: Sequence[Sequence[tuple[int, int, int]]]) -> st
 
 def forbidden_equalities(equalities: Iterable[Equality]) -> str:
     """The rule that these equalities of steps do not all hold."""
-    atoms = [f"same{'' if e.of == 'dstate' else '_place'}({min(e.first, e.second)},{max(e.first, e.second)})" for e in equalities]
+    atoms = [
+        f"{'' if e.holds else 'not '}same{'' if e.of == 'dstate' else '_place'}({min(e.first, e.second)},{max(e.first, e.second)})"
+        for e in equalities
+    ]
     return f":- {', '.join(atoms)}."
+
+
+def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
+    """The rules that say: some doubt holds where this one is open, and two things are one (or are not); the condition of that is None where they never are."""
+    rules = [f"#external {open_doubt(number)}."]
+    rules += [f"one_in_doubt({number}) :- {condition}."] if condition else [f"#external one_in_doubt({number})."]
+    return "\n".join([*rules, f"{some_doubt(part)} :- {open_doubt(number)}, {'' if one else 'not '}one_in_doubt({number})."])
+
+
+def doubts_before(part: int) -> str:
+    """The rule that some doubt holds where some doubt of an earlier part does."""
+    return f"{some_doubt(part)} :- {some_doubt(part - 1)}." if part > 1 else f"#external {some_doubt(0)}."
+
+
+def steps_are_one(sort: str, i: int, j: int) -> str:
+    """The condition that two steps, the earlier one first, are one in the readable encodings: as to dstate, place, path or course. A step with itself: that it is along a path."""
+    return {
+        "dstates": f"same({i},{j})",
+        "places": f"same_place({i},{j})",
+        "paths": f"along({i},H,_), along({j},H,_)",
+        "courses": f"same_course({i},{j})",
+    }[sort]
+
+
+def open_doubt(number: int) -> Symbol:
+    """The external atom that a doubt is open."""
+    return Function("open_doubt", numbers(number))
+
+
+def some_doubt(part: int) -> Symbol:
+    """The atom that some open doubt of this part of a program or of an earlier one holds."""
+    return Function("some_doubt", numbers(part))
+
+
+def exactly(number: int, count: Count) -> str:
+    """The rule that a map has just so many dstates, places or paths, while `of_number` is true."""
+    counted = {"dstates": "T : is(T,T)", "places": "T : at(T,T)", "paths": "(T,H) : first_along(T,H)"}[count]
+    return f"#external {of_number(number, count)}.\n:- {of_number(number, count)}, #count {{ {counted} }} != {number}."
+
+
+def of_number(number: int, count: Count) -> Symbol:
+    """The external atom that says that maps have just so many dstates, places or paths."""
+    return Function("of_number", [Function(count), *numbers(number)])
 
 
 def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
@@ -591,6 +665,17 @@ class PathReader:
         self._order: dict[int, list[int]] = {}  # for each path, its places in the answer that was read last
         self._placed: _Placed | None = None  # what the places of the last map tell, as they are mostly the same in the next
         self._made: dict[tuple[object, ...], DState] = {}  # dstates made so far, as most of them are in most maps
+
+    def condition(self, sort: str, i: int, j: int) -> str | None:
+        """The condition that two dstates of a map are one in the answer: as to place, path or course. None where they never are."""
+        if sort == "places":
+            return f"at({self._dstates[i][1]},P,_), at({self._dstates[j][1]},P,_)"
+        runs = {dstate: (segment, direction) for segment, members in self._runs.items() for dstate, direction in members}
+        if i not in runs or j not in runs:
+            return None
+        (g, d), (h, e) = runs[i], runs[j]
+        same_way = f", {d} * D == {e} * E" if sort == "courses" else ""
+        return f"course({g},H,D), course({h},H,E){same_way}"
 
     def read(self, model: Model) -> PathAnswer:
         """The values that map_of needs of an answer."""

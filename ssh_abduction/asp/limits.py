@@ -72,6 +72,12 @@ class Watch:
     def start(self) -> None:
         self._started = time.perf_counter()
 
+    def begin_anew(self) -> None:
+        """Count time from now, as if none were spent, up to the whole limit."""
+        self._spent, self._next_tick, self._stage_ends, self.interrupted = 0.0, TICK, math.inf, False
+        self.use_reserve()
+        self.start()
+
     @property
     def has_reserve(self) -> bool:
         """Whether a share of the time limit is still kept for finding any map."""
@@ -87,6 +93,11 @@ class Watch:
 
     def stop(self) -> None:
         self._spent, self._started = self.elapsed(), None
+
+    @property
+    def reserve_begins(self) -> float:
+        """When only the share of the time limit is left that is kept for what comes last."""
+        return math.inf if self._limit is None else self._limit * (1 - RESERVE)
 
     def part(self, seconds: float) -> Watch:
         """A watch that allows so many seconds from now, and ends earlier where this one does."""

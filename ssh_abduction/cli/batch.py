@@ -27,12 +27,13 @@ from ssh_abduction.asp.limits import Stop as SearchStop
 from ssh_abduction.cli import EXIT_ERROR, EXIT_INTERRUPTED, workers
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import theory_of
-from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, interrupted_code, on_ctrl_c, opening, warn, warnings_of
+from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, interrupted_code, on_ctrl_c, opening, told, warn, warnings_of
 from ssh_abduction.cli.text import headline
 from ssh_abduction.errors import SolverError, SSHError, brief, named, printable
 from ssh_abduction.explain import Explanation
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
+from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
@@ -78,7 +79,7 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked about each trace: limit, maps, memory and speedups as of Search. Plain data, as it travels to other processes and machines."""
+    """What is asked about each trace: limit, maps, within, memory and speedups as of Search. Plain data, as it travels to other processes and machines."""
 
     theory: Theory
     limit: float | None
@@ -86,6 +87,7 @@ class Question:
     memory: int | None
     speedups: Speedups
     json: bool
+    within: int = 0
 
     def answer(self, number: int, path: str, trace: Trace | None = None, given_up: Callable[[], bool] = lambda: False) -> Answer:
         """Solve a trace, read from its file if it did not come along. Whatever goes wrong is the answer. Stops when it is given up."""
@@ -104,14 +106,22 @@ class Question:
                 search.interrupt()
 
         search = Search(
-            trace, self.theory, limit=self.limit, maps=self.maps, memory=self.memory, speedups=self.speedups, on_progress=on_progress
+            trace,
+            self.theory,
+            limit=self.limit,
+            maps=self.maps,
+            within=self.within,
+            reasons=self.json,
+            memory=self.memory,
+            speedups=self.speedups,
+            on_progress=on_progress,
         )
         maps: list[dict[str, Any]] = []
         with self._guarded(number, path, search, maps, given_up):
             for ssh_map in search:
-                maps += [ssh_map.to_dict()] if self.json else []
+                maps += [told(search, ssh_map)] if self.json else []
             explanation = explained(search)
-            return self._told(number, path, search, search.solution(), maps, explanation, search.grounding)
+            return self._told(number, path, search, search.solution(), maps, explanation, search.grounding, search.backbone)
 
     def _guarded(
         self, number: int, path: str, search: Search, maps: list[dict[str, Any]], given_up: Callable[[], bool]
@@ -122,7 +132,7 @@ class Question:
             solution = search.snapshot(why)
             found = [*maps] or [ssh_map.to_dict() for ssh_map in solution.maps if self.json]
             return self._told(
-                number, path, search, solution, found, None, Grounding(0, 0)
+                number, path, search, solution, found, None, Grounding(0, 0), None
             ), EXIT_ERROR  # of the process, which nobody reads
 
         if not workers.serves():
@@ -138,10 +148,13 @@ class Question:
         maps: Sequence[dict[str, Any]],
         explanation: Explanation | None,
         grounding: Grounding,
+        backbone: Backbone | None,
     ) -> Answer:
         if self.json:
             count = len(maps)
-            line = dump({"trace": path, **opening(search), "maps": maps, **ending(search, solution, explanation, count, grounding)})
+            line = dump(
+                {"trace": path, **opening(search), "maps": maps, **ending(search, solution, explanation, count, grounding, backbone)}
+            )
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
         return Answer(number, line, exit_code(solution), tuple(warnings_of(search, solution)))
@@ -171,7 +184,7 @@ def run(options: argparse.Namespace) -> int:
     speedups = Speedups.without(options.without_speedups)
     if options.scheduler or options.jobs not in (None, 1):
         speedups = replace(speedups, threads=False)  # the processors have other traces to solve
-    question = Question(theory_of(options), options.time_limit, options.maps, options.memory_limit, speedups, options.json)
+    question = Question(theory_of(options), options.time_limit, options.maps, options.memory_limit, speedups, options.json, options.within)
     with tempfile.TemporaryDirectory() as folder:
         stop = Stop(Path(folder) / "stop")
         if options.scheduler is None:

@@ -13,7 +13,10 @@ from typing import Any
 from ssh_abduction.asp.control import Grounding
 from ssh_abduction.explain import Explanation, Interrupted, explain
 from ssh_abduction.files import json_line
+from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import Search, Solution, Status
+from ssh_abduction.solver.result import summary_of
+from ssh_abduction.solver.sharing import Backbone
 
 SOON = 10_000  # steps of a trace in which noise is sought after Ctrl-C, at most: in 40,000 that takes two seconds
 
@@ -43,11 +46,21 @@ def explained(search: Search) -> Explanation | None:
 
 def opening(search: Search) -> dict[str, Any]:
     """What the JSON of a solution says before its maps."""
-    return {"theory": search.theory.to_dict(), "steps": len(search.trace)}
+    return {"theory": search.theory.to_dict(), "steps": len(search.trace), **({"within": search.within} if search.within else {})}
 
 
-def ending(search: Search, solution: Solution, explanation: Explanation | None, maps: int, grounding: Grounding) -> dict[str, Any]:
-    """What the JSON of a solution says after its maps, of which there were so many."""
+def told(search: Search, ssh_map: SSHMap) -> dict[str, Any]:
+    """What the JSON of a solution says of the map that was given last: also what it costs, where not all maps cost the same."""
+    return ssh_map.to_dict() | ({"cost": search.cost.to_dict()} if search.within and search.cost else {})
+
+
+def ending(
+    search: Search, solution: Solution, explanation: Explanation | None, maps: int, grounding: Grounding, backbone: Backbone | None
+) -> dict[str, Any]:
+    """What the JSON of a solution says after its maps, of which there were so many.
+
+    backbone  what the minimal maps share, as far as it is known
+    """
     end: dict[str, Any] = {
         "status": solution.status.value,
         "complete": solution.complete,
@@ -58,6 +71,11 @@ def ending(search: Search, solution: Solution, explanation: Explanation | None, 
         "grounding": asdict(grounding),
         "seconds": {k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")},
     }
+    end["summary"] = summary_of(solution, maps, backbone)
+    if backbone and not (solution.minimal_listed and maps == 1):
+        end["backbone"] = backbone.to_dict()
+    if solution.within:
+        end["levels"] = [level.to_dict() for level in solution.levels]
     if solution.certificate:
         end["certificate"] = solution.certificate.to_dict(search.trace)
     if solution.stopped:

@@ -14,12 +14,13 @@ from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
-from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, on_ctrl_c, opening, warn, warnings_of
-from ssh_abduction.cli.text import by_displacements, describe, differences, headline
+from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, on_ctrl_c, opening, told, warn, warnings_of
+from ssh_abduction.cli.text import by_displacements, describe, describe_backbone, differences, headline
 from ssh_abduction.explain import Explanation
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.solver.result import Progress, Solution, Status
+from ssh_abduction.solver.result import Progress, Solution, Status, summary_of
 from ssh_abduction.solver.search import Search
+from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 from ssh_abduction.trace import Trace
 
@@ -32,6 +33,8 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser("solve", help="find the minimal maps of a trace, or of many", description=text)
     parser.add_argument("traces", nargs="+", metavar="trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument("-n", "--maps", type=int, default=100, metavar="K", help="stop after K maps; 0 for all (default: 100)")
+    more = "list maps with up to K dstates more than the least, too: for each number of dstates the best (default: 0)"
+    parser.add_argument("--within", type=int, default=0, metavar="K", help=more)
     parser.add_argument(
         "--json", action="store_true", help="print the solution as JSON, map by map as they are found; of many traces, a line each"
     )
@@ -68,6 +71,8 @@ def run(options: argparse.Namespace) -> int:
                 theory,
                 limit=options.time_limit,
                 maps=options.maps,
+                within=options.within,
+                reasons=True,
                 memory=options.memory_limit,
                 speedups=Speedups.without(options.without_speedups),
                 on_progress=on_progress,
@@ -102,14 +107,14 @@ class _Text:
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
         """All that is to be printed."""
-        return "".join(f"{line}\n" for line in _lines(self._search, solution, explanation))
+        return _text(_lines(self._search, solution, explanation, self._search.backbone))
 
     def last_words(self, why: Stop) -> tuple[str, int]:
         """What is known, where the search cannot be ended in time, and the exit code."""
         solution = self._search.snapshot(why)
         kept = tuple(self.kept) if solution.status is Status.OPTIMAL and self.kept else solution.maps
         warn(warnings_of(self._search, solution))
-        return self.end(replace(solution, maps=kept), None), exit_code(solution)
+        return _text(_lines(self._search, replace(solution, maps=kept), None, None)), exit_code(solution)
 
 
 class _Json:
@@ -129,9 +134,12 @@ class _Json:
             say(partial(self._line, ssh_map))
         return explained(self._search)
 
-    def end(self, solution: Solution, explanation: Explanation | None, grounding: Grounding | None = None) -> str:
+    def end(self, solution: Solution, explanation: Explanation | None) -> str:
         """What comes after the maps."""
-        return "\n]," + dump(ending(self._search, solution, explanation, self._maps, grounding or self._search.grounding))[1:] + "\n"
+        return self._end(solution, explanation, self._search.grounding, self._search.backbone)
+
+    def _end(self, solution: Solution, explanation: Explanation | None, grounding: Grounding, backbone: Backbone | None) -> str:
+        return "\n]," + dump(ending(self._search, solution, explanation, self._maps, grounding, backbone))[1:] + "\n"
 
     def last_words(self, why: Stop) -> tuple[str, int]:
         """What is missing, with what is known, where the search cannot be ended in time, and the exit code."""
@@ -140,7 +148,8 @@ class _Json:
         words = "" if self._begun else self._opening()
         if not self._maps and solution.maps:
             words += self._line(solution.maps[0])
-        return words + self.end(solution, None, Grounding(0, 0)), exit_code(solution)  # clingo is not asked while another thread is in it
+        # Clingo is not asked while another thread is in it; nor is the backbone, which that thread may be changing.
+        return words + self._end(solution, None, Grounding(0, 0), None), exit_code(solution)
 
     def _opening(self) -> str:
         self._begun = True
@@ -148,10 +157,14 @@ class _Json:
 
     def _line(self, ssh_map: SSHMap) -> str:
         self._maps += 1
-        return ("," if self._maps > 1 else "") + "\n" + dump(ssh_map.to_dict())
+        return ("," if self._maps > 1 else "") + "\n" + dump(told(self._search, ssh_map))
 
 
-def _lines(search: Search, solution: Solution, explanation: Explanation | None) -> Iterator[str]:
+def _text(lines: Iterator[str]) -> str:
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _lines(search: Search, solution: Solution, explanation: Explanation | None, backbone: Backbone | None) -> Iterator[str]:
     yield headline(solution, search.count, explanation)
     yield from by_displacements(solution)
     if solution.status is Status.UNSATISFIABLE:
@@ -164,6 +177,10 @@ def _lines(search: Search, solution: Solution, explanation: Explanation | None) 
             yield f"\nbest map of the first {len(solution.partial.labels)} steps\n{describe(solution.partial)}"
         return
     yield f"\n{'map 1' if search.count > 1 else 'map'}\n{describe(solution.maps[0])}"
+    if backbone and (search.count > 1 or not solution.complete):
+        yield f"\n{summary_of(solution, search.count, backbone)}"
+    if backbone and not solution.minimal_listed:
+        yield describe_backbone(backbone, search.trace)
     if len(solution.maps) > 1:
         some = "" if search.count <= SHOWN else f" (the first {SHOWN}; --json lists all)"
         yield f"\nwhat tells the maps apart{some}\n{differences(solution.maps, search.trace)}"

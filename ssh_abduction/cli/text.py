@@ -9,13 +9,21 @@ from ssh_abduction.errors import printable
 from ssh_abduction.explain import Explanation
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.result import Solution, Status
+from ssh_abduction.solver.sharing import Backbone, stretches
+from ssh_abduction.theory.evidence import evidence_of
 from ssh_abduction.trace import Trace
+
+# So many pairs of steps are told of, at most, as more cannot be taken in on a terminal.
+SHOWN_PAIRS = 12
 
 
 def headline(solution: Solution, count: int, explanation: Explanation | None) -> str:
     """How a search ended, on one line. `count` is how many maps it found, of which the solution need not hold any."""
     if explanation:
         return f"{solution.status.value}: {explanation}"
+    if solution.status is Status.UNSATISFIABLE and not solution.stopped:
+        kinds = ", ".join(evidence.name for evidence in evidence_of(solution.theory))
+        return f"unsatisfiable: no map satisfies the axioms: those that clingo found are refused as wholes, by evidence ({kinds})"
     if solution.status is Status.UNSATISFIABLE:
         return f"unsatisfiable: no map satisfies the axioms; why was not found out in time ({solution.stopped})"
     why = f" ({solution.stopped})" if solution.stopped else ""
@@ -26,7 +34,16 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
     counts = ", ".join(counted(v, k) for k, v in solution.cost.to_dict().items())
     if solution.status is Status.FEASIBLE:
         return f"feasible{why}: {counts}, not proven minimal; any map has {bound or 'no proven bound'}; {seconds}"
-    return f"optimal: {counts}; {counted(count, 'minimal maps')}{'' if solution.complete else f', and there may be more{why}'}; {seconds}"
+    found = counted(solution.levels[0].count if solution.levels else count, "minimal maps") + _levels_above(solution)
+    beyond = f" that cost up to {solution.within} more" if solution.minimal_listed else ""
+    return f"optimal: {counts}; {found}{'' if solution.complete else f', and there may be more{beyond}{why}'}; {seconds}"
+
+
+def _levels_above(solution: Solution) -> str:
+    """How many maps cost more than the least, and what they cost."""
+    return "".join(
+        f"; {level.count} with {', '.join(counted(v, k) for k, v in level.cost.to_dict().items())}" for level in solution.levels[1:]
+    )
 
 
 def by_displacements(solution: Solution) -> Iterator[str]:
@@ -78,6 +95,23 @@ def describe(ssh_map: SSHMap) -> str:
         parts.append(table(["dstate", "view", "place", "path", "links"], rows))
     else:
         parts.append(table(["dstate", "view", "links"], [[row[0], row[1], row[4]] for row in rows]))
+    return "\n".join(parts)
+
+
+def describe_backbone(backbone: Backbone, trace: Trace) -> str:
+    """For each dstate that all minimal maps have, the steps at it; then the steps that are one dstate, or at one place, in some minimal maps only."""
+    steps: dict[int, list[int]] = {}
+    for t, number in enumerate(backbone.dstates.always):
+        steps.setdefault(number, []).append(t)
+    rows = [[trace.steps[some[0]].view, stretches(some)] for some in steps.values()]
+    parts = [
+        table(["view", "steps at one dstate in all minimal maps" if backbone.proven else "steps at one dstate in all maps found"], rows)
+    ]
+    for sort, pairs in (("one dstate", backbone.dstates.sometimes), ("at one place", backbone.places.sometimes if backbone.places else ())):
+        if pairs:
+            more = f", and {len(pairs) - SHOWN_PAIRS} more" if len(pairs) > SHOWN_PAIRS else ""
+            told = ", ".join(f"{i} and {j}" for i, j in pairs[:SHOWN_PAIRS])
+            parts.append(f"  {sort} in some of them: the steps {told}{more}")
     return "\n".join(parts)
 
 

@@ -17,7 +17,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    print("presets: on, or stars (on where the trace has stars), or –")
+    print("presets: on, or stars (on where the trace has stars that fit right angles), or gateways (on where it has other stars), or –")
     for level in encodings.levels():
         print(f"\n{level}")
         rows = [
@@ -34,4 +34,5 @@ def _state(name: str, preset: str) -> str:
     theory = PRESETS[preset]()
     if name in theory.axioms:
         return "on"
-    return "stars" if theory.star == "auto" and name in theory.replace(star="frame").axioms else "–"
+    settled = {"stars": "frame", "gateways": "gateways"} if theory.star == "auto" else {}
+    return next((said for said, star in settled.items() if name in theory.replace(star=star).axioms), "–")

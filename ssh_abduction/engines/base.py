@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from ssh_abduction.asp.control import Asker, has_processors
 from ssh_abduction.asp.limits import Watch
+from ssh_abduction.engines.doubts import Settled
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
@@ -41,6 +42,11 @@ class Cost:
     def to_dict(self) -> dict[str, int]:
         counts = {"dstates": self.dstates, "places": self.places, "paths": self.paths}
         return {**counts, "excuses": self.excuses} if self.excuses else counts
+
+
+def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> Cost:
+    """The counts of a map: those that the theory prefers as clingo counted them, since it may count more than the map can show where axioms are left out."""
+    return replace(Cost.of(ssh_map), **dict(zip(theory.priorities, cost, strict=True)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +148,10 @@ class Engine(Protocol):
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         """All maps of the prefix that cost this and no more; or `enough` of them, unless that is 0."""
+        ...
+
+    def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled] | None:
+        """All labels that maps of the prefix have which cost this and no more, each once; None where dstates are not settled before places and paths."""
         ...
 
     def forbid(self, equalities: Collection[Equality]) -> bool:

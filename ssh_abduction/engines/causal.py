@@ -54,6 +54,9 @@ class CausalEngine:
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         return map(self._found, self._named.all_of(cost[0], enough))
 
+    def labellings(self, cost: tuple[int, ...]) -> None:
+        """Labels are the maps."""
+
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._named.forbid_together([(equality.first, equality.second) for equality in equalities])
         return True

@@ -38,6 +38,7 @@ from ssh_abduction.asp.control import Asker, give_threads, mapped
 from ssh_abduction.asp.limits import Watch
 from ssh_abduction.asp.process import in_process
 from ssh_abduction.engines.base import Found, Task, next_charted_size
+from ssh_abduction.engines.doubts import Settled
 from ssh_abduction.engines.nearby import Beside, NearbySearch
 from ssh_abduction.engines.paths import Paths
 from ssh_abduction.engines.refusing import all_accepted, first_accepted_of
@@ -340,6 +341,17 @@ class FramedEngine:
         namings = self._best[1] if self._best and self._best[0] == cost else self._all_with_paths(cost[0])
         mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
         yield from islice((found for naming in namings for found in self._maps(naming, mode)), enough or None)
+
+    def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
+        if not self._framed:
+            return
+        mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
+        for naming in self._best[1] if self._best and self._best[0] == cost else self._all_with_paths(cost[0]):
+            control = naming.control or self._path_control(naming.labels)
+            reader = facts.PathReader(control, self._task.trace, self._task.theory, self._chart, naming.labels)
+            settled = Settled(self.asker, control, mode, reader, reader.map_of)
+            if settled.has_map():
+                yield settled
 
     def _all_with_paths(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[_Naming]:
         """All labels with so many dstates that have paths, each once, and not those."""

@@ -28,6 +28,7 @@ import clingo
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker, Control, mapped
 from ssh_abduction.engines.base import Found, Task, next_charted_size
+from ssh_abduction.engines.doubts import Settled
 from ssh_abduction.engines.naming import NamedLabels
 from ssh_abduction.engines.paths import PREPARING
 from ssh_abduction.engines.refusing import all_accepted
@@ -134,6 +135,13 @@ class FramelessEngine:
         every = self._best[1] if self._best and self._best[0] == cost else self._all_that_fit(cost[0])
         mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
         yield from islice((found for labels in every for found in self._fitting.maps(labels, mode)), enough or None)
+
+    def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
+        mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
+        for labels in self._best[1] if self._best and self._best[0] == cost else self._all_that_fit(cost[0]):
+            settled = self._fitting.settled(labels, mode)
+            if settled.has_map():
+                yield settled
 
     def _all_that_fit(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[list[int]]:
         """All labels with so many dstates that have places and paths, each once, and not those."""
@@ -263,6 +271,12 @@ class PlacesAndPaths:
             self._asker.watch.check()
             self._asked = key, control
         return self._asked[1]
+
+    def settled(self, labels: Sequence[int], mode: str) -> Settled:
+        """The maps with these dstates."""
+        control = self._path_control(labels)
+        reader = facts.PathReader(control, self._task.trace, self._task.theory, self.named.chart, labels)
+        return Settled(self._asker, control, mode, reader, lambda answer: reader.map_of(answer).without_headings())
 
     def improving_maps(self, labels: Sequence[int]) -> Iterator[Found]:
         """Maps with these dstates, each as good as the one before or better, the last one best; none if no places and paths fit them."""

@@ -10,8 +10,11 @@ import clingo
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker
 from ssh_abduction.engines.base import Found, Task
+from ssh_abduction.engines.doubts import Doubt, Doubts
+from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.theory import Count
 
 # A prefix grows by this factor at least, so that there are few of them.
 GROWTH = 1.25
@@ -34,9 +37,11 @@ class StepEngine:
         self._task = task
         self._asked: int | None = None  # the step that is the last one, as far as clingo knows
         self._forbidden: list[Collection[Equality]] = []
+        self._number: tuple[int, Count] | None = None  # how many dstates, places or paths maps have, where somebody asked for just so many
         # Seconds and MiB that it took to ground the last step: the next one takes about as much, and cannot be stopped.
         self._last_step = 0.0, 0.0
         control = self.asker.control
+        self._doubts = Doubts(self.asker, control, facts.steps_are_one)
         for name in facts.encoding_names(task.theory):
             control.load(encodings.path(name))
         control.add("base", [], facts.theory_facts(task.theory, paths))
@@ -45,7 +50,7 @@ class StepEngine:
     def with_paths(self, paths: int) -> StepEngine:
         engine = StepEngine(self._task, paths)
         engine.asker.ground_seconds, engine.asker.solve_seconds = self.asker.ground_seconds, self.asker.solve_seconds
-        engine._forbidden = list(self._forbidden)
+        engine._forbidden, engine._number = list(self._forbidden), self._number
         return engine
 
     def over(self, task: Task) -> StepEngine:
@@ -69,6 +74,7 @@ class StepEngine:
             if is_new:
                 for number in range(len(self._forbidden)):
                     self._tell_forbidden(number)
+                self._tell_number()
 
     def _ground_steps(self, stop: int) -> None:
         """Ground the steps up to this one."""
@@ -107,10 +113,33 @@ class StepEngine:
         bound = ",".join(map(str, cost))
         return self.asker.answers(self._read, f"enum,{bound}" if bound else "ignore", 0)
 
+    def map_with(self, doubts: Collection[Doubt], cost: tuple[int, ...]) -> SSHMap | None:
+        """A map of the prefix that costs at most this, in which any of these doubts about steps holds; None where there is none."""
+        found = self._doubts.answer(doubts, self._read, f"enum,{','.join(map(str, cost))}" if cost else "ignore")
+        return None if found is None else found.map
+
+    def labellings(self, cost: tuple[int, ...]) -> None:
+        """Dstates are not settled before places and paths."""
+
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._forbidden.append(equalities)
         self._tell_forbidden(len(self._forbidden) - 1)
         return True
+
+    def ask_for(self, number: int, count: Count) -> None:
+        """From now on maps have just so many dstates, places or paths, and the prefix does not grow any more."""
+        if self._number is not None:
+            self.asker.control.release_external(facts.of_number(*self._number))
+        self._number = number, count
+        self._tell_number()
+
+    def _tell_number(self) -> None:
+        if self._number is None:
+            return
+        part = f"number_{self._number[0]}"
+        self.asker.control.add(part, [], facts.exactly(*self._number))
+        self.asker.control.ground([(part, [])])
+        self.asker.control.assign_external(facts.of_number(*self._number), True)
 
     def settle(self) -> None:
         """Nothing goes on in clingo beyond an answer."""
@@ -122,3 +151,17 @@ class StepEngine:
 
     def _read(self, model: clingo.Model) -> Found:
         return Found(facts.read_map(model, self._task.trace, self._task.theory), tuple(model.cost))
+
+
+def paths_needed(task: Task, size: int, cost: tuple[int, ...] | None) -> int:
+    """How many names for paths it takes to be sure that no map of the prefix has another cost, or is missed at this one."""
+    theory = task.theory
+    segments = facts.most_paths(task.trace, theory, size)
+    first = theory.priorities[0] if theory.priorities else None
+    if theory.level == "causal":
+        return 0
+    if cost is None or not task.speedups.path_names or first not in ("paths", "dstates"):
+        return segments
+    if first == "paths":
+        return cost[0]
+    return min(segments, cost[0] // (1 if "course_needs_travel" in theory.given_up else 2))

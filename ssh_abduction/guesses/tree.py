@@ -257,7 +257,7 @@ class Sketch:
 
     def _star(self, step: Step, heading: int) -> object:
         """The star of a place at which this is seen with this heading, in the frame of the place if it has one."""
-        star = step.openings if self._theory.star != "none" else None
+        star = step.openings if self._theory.star in ("pattern", "frame") else None
         if self._framed and star is not None:
             return tuple(star[(slot - heading) % 4] for slot in range(4))
         return observation(step, self._theory)[1]

@@ -20,15 +20,18 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from graphlib import CycleError, TopologicalSorter
 from typing import TypeAlias
 
 from ssh_abduction.errors import MapError, brief
+from ssh_abduction.judge.gateways import Clash, Sight, clashes, headings
+from ssh_abduction.judge.planarity import Edges
 from ssh_abduction.maps import DState, SSHMap
+from ssh_abduction.star import Openings, Star
 from ssh_abduction.theory.theory import Theory, checked_theory
-from ssh_abduction.trace import Action, Openings, Trace, View, checked_trace
+from ssh_abduction.trace import Action, Trace, View, checked_trace
 
 COHERENCE = "map_explains_trace"
 QUARTERS = {"right": 1, "around": 2, "left": 3}
@@ -78,6 +81,15 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
     reading = _Reading(trace, ssh_map, theory)
     checks = [(COHERENCE, test) for test in _COHERENCE] + [(name, AXIOMS[name]) for name in theory.axioms if name in AXIOMS]
     return tuple(Violation(name, tuple(sorted(set(steps))), message) for name, test in checks for steps, message in test(reading))
+
+
+def turned(trace: Trace, ssh_map: SSHMap, theory: Theory) -> SSHMap | None:
+    """A map with headings that all stars of a trace allow (star=gateways), None where they allow none. A map of fewer steps may show other headings."""
+    reading = _Reading(trace, ssh_map, theory)
+    found = headings(*reading.sights, reading.axioms)
+    if any(s.place is not None and s.id not in found for s in ssh_map.dstates):
+        return None
+    return replace(ssh_map, dstates=tuple(replace(s, heading=found.get(s.id)) for s in ssh_map.dstates))
 
 
 def unchecked(theory: Theory) -> tuple[str, ...]:
@@ -244,7 +256,7 @@ class _Reading:
         self._read()
 
     def _read(self) -> None:
-        labels, with_stars = self.map.labels, self.theory.star != "none"
+        labels, with_stars = self.map.labels, self.theory.star in ("pattern", "frame")
         for i, (label, step) in enumerate(zip(labels, self.trace.steps, strict=False)):
             self.first.setdefault(label, i)
             self.views.setdefault((label, step.view), i)
@@ -352,6 +364,31 @@ class _Reading:
     @cached_property
     def excused(self) -> set[frozenset[int]]:
         return {frozenset(pair) for pair in self.map.excused if _is_pair(pair)} if self.theory.boundary == "defeasible" else set()
+
+    @cached_property
+    def sights(self) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
+        """The dstates with the stars seen there, by the steps that first have them, and the turns at places that lead from one to another."""
+        sights: dict[tuple[int, Star], Sight] = {}
+        seen: list[Sight | None] = []
+        shown: set[int] = set()
+        places: set[int | None] = set()
+        for i, (label, step) in enumerate(zip(self.map.labels, self.trace.steps, strict=False)):
+            s, star = self.states.get(label), step.gateways or Star(())
+            if s and (label, star) not in sights:
+                sights[label, star] = Sight(s, star, i, label not in shown, s.place not in places)
+                shown.add(label)
+                places.add(s.place)
+            seen.append(sights.get((label, star)))
+        turns: dict[tuple[Sight, Sight], set[Action]] = defaultdict(set)
+        for a, b, action in zip(seen, seen[1:], self.trace.actions, strict=False):
+            if a and b and action.kind == "turn" and a.dstate.place == b.dstate.place:
+                turns[a, b].add(action)
+        return list(sights.values()), turns
+
+    @cached_property
+    def clashes(self) -> list[Clash]:
+        """The places at which the stars seen cannot be one star in tolerance."""
+        return list(clashes(*self.sights, self.axioms))
 
     @cached_property
     def conflicts(self) -> list[_Conflict]:
@@ -484,7 +521,7 @@ def _has_what_the_theory_has(m: _Reading) -> Found:
     for s in m.map.dstates:
         if causal and (s.place, s.path, s.direction) != (None, None, None):
             yield m.steps_of(s.id), f"Dstate {s.id} has a place, path or direction, but the theory is causal."
-        if m.theory.star != "frame" and s.heading is not None:
+        if m.theory.star not in ("frame", "gateways") and s.heading is not None:
             yield m.steps_of(s.id), f"Dstate {s.id} has a heading, but the places of the theory have no frames."
     if m.map.excused and m.theory.boundary != "defeasible":
         yield [], "The map excuses pairs of paths, but the theory excuses none."
@@ -509,10 +546,11 @@ def _orders_list_places_once(m: _Reading) -> Found:
 
 def _frames_start_at_first_visit(m: _Reading) -> Found:
     """The dstate at which a place is first visited has heading 0."""
-    if "one_heading" not in m.axioms:
+    if not {"one_heading", "gateway_heading"} & m.axioms:
         return
     for p, i in m.place_seen.items():
-        if heading := _heading(m.states[m.map.labels[i]]):
+        s = m.states[m.map.labels[i]]
+        if heading := s.heading if m.theory.star == "gateways" else _heading(s):
             yield [i], f"Place {p} is first visited at step {i} with heading {heading} instead of 0."
 
 
@@ -796,6 +834,52 @@ def _path_goes_straight(m: _Reading) -> Found:
                 )
 
 
+def _gateways(name: str, m: _Reading) -> Found:
+    """The axioms of places with any number of gateways. A map does not show which gateway is which, so a clash is told under each axiom that takes part."""
+    for clash in m.clashes:
+        if name in clash.axioms:
+            steps = ", ".join(map(str, clash.steps))
+            yield (
+                clash.steps,
+                f"What is seen at steps {steps} cannot be one place, {clash.place}: the gateways do not agree, however turned.",
+            )
+
+
+# Planarity
+
+
+def _planar(m: _Reading) -> Found:
+    """Paths meet at places only: the map can be drawn in the plane, with turns right to the right, without a crossing."""
+    place_of = {s.id: s.place for s in m.states.values() if s.place is not None}
+    headings = {s: heading for s in place_of if (heading := _heading(m.states[s])) is not None}
+    turns = [(t.source.id, t.action.turn, t.target.id) for t in m.turns if t.action.turn and {t.source.id, t.target.id} <= place_of.keys()]
+    stars = {s: [star for state, star, _ in _stars(m) if state.id == s] for s in place_of} if "star_frame" in m.axioms else {}
+
+    def cross(travels: Sequence[_Move]) -> bool:
+        edges = Edges([(t.source.id, t.target.id) for t in travels], turns, place_of)
+        if m.theory.star != "frame":
+            return not edges.can_be_drawn(crossing=m.theory.symmetric_sides)
+        if headings.keys() == place_of.keys() and edges.can_be_drawn_by(headings):
+            return False
+        turned, distinct = {"turn_rotates", "one_heading"} <= m.axioms, "one_dstate_per_heading" in m.axioms
+        return not edges.can_be_drawn_in_frames(stars, turned=turned, distinct=distinct)
+
+    kept = [t for t in m.travels if {t.source.id, t.target.id} <= place_of.keys()]
+    if not cross(kept):
+        return
+    for t in list(kept):
+        if cross(fewer := [other for other in kept if other is not t]):
+            kept = fewer
+    ways = ", ".join(f"{t.source.place} to {t.target.place} (step {t.step})" for t in kept)
+    yield (
+        [step for t in kept for step in t.steps],
+        f"However it is drawn, paths cross where there is no place; travels lead along them from place {ways}.",
+    )
+
+
+# What somebody says
+
+
 def _asserted(m: _Reading) -> Found:
     """What somebody asserts of pairs of steps holds in the map."""
     labels, theory = m.map.labels, m.theory
@@ -854,6 +938,12 @@ AXIOMS: dict[str, Check] = {
     "turn_rotates": _turn_rotates,
     "one_dstate_per_heading": _one_dstate_per_heading,
     "path_goes_straight": _path_goes_straight,
+    "gateway_frame": partial(_gateways, "gateway_frame"),
+    "gateway_heading": partial(_gateways, "gateway_heading"),
+    "gateway_turn": partial(_gateways, "gateway_turn"),
+    "gateway_dstate": partial(_gateways, "gateway_dstate"),
+    "gateway_path": partial(_gateways, "gateway_path"),
     "asserted": _asserted,
     "one_pose": _one_pose,
+    "planar": _planar,
 }

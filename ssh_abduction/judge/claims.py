@@ -97,12 +97,50 @@ class _Claims:
                 yield f"cost: expected {_text(expected)}, {because}, got {_text(cost)}"
         if self.theory.without:
             return  # where axioms are left out, clingo may count more than the maps show
-        best = [counts[name] for counts in self.counts[:1] for name in self.theory.priorities]
-        for i, counts in enumerate(self.counts):
-            here = [counts[name] for name in self.theory.priorities]
-            if here != best:
+        if "within" in self.answer:
+            yield from self._costs_within(self.answer["within"])
+            return
+        best = self._preferred(0)
+        for i in range(len(self.counts)):
+            if (here := self._preferred(i)) != best:
                 preferred = ", ".join(self.theory.priorities)
                 yield f"maps: expected equal numbers of {preferred}, as minimal maps have, got {best} in map 1 and {here} in map {i + 1}"
+
+    def _preferred(self, i: int) -> list[int]:
+        """What a map has of what the theory prefers, first to last; nothing, where there is no such map."""
+        return [counts[name] for counts in self.counts[i : i + 1] for name in self.theory.priorities]
+
+    def _costs_within(self, within: Any) -> Iterator[str]:
+        """Maps come by their number of dstates, or of what else the theory prefers first, excuses aside: none has too many, those that have equally many
+        are as good as each other, and each map and each level costs what is claimed.
+        """
+        counted = next((name for name in self.theory.priorities if name != "excuses"), None)
+        if not is_whole(within) or within < 0:
+            yield f"within: expected a whole number, 0 or more, got {brief(within)}"
+            return
+        for i, counts in enumerate(self.counts):
+            last = self.counts[max(i - 1, 0)]
+            most = self.counts[0][counted] + within if counted else 0
+            if counted and not last[counted] <= counts[counted] <= most:
+                yield f"maps: expected {last[counted]} to {most} {counted} in map {i + 1}, as within is {within}, got {counts[counted]}"
+            elif (not counted or last[counted] == counts[counted]) and self._preferred(i) != self._preferred(max(i - 1, 0)):
+                best, here = self._preferred(i - 1), self._preferred(i)
+                preferred = ", ".join(self.theory.priorities)
+                yield f"maps: expected equal numbers of {preferred}, as those of one level have, got {best} in map {i} and {here} in map {i + 1}"
+        shown = [{k: v for k, v in counts.items() if v or k != "excuses"} for counts in self.counts]
+        yield from self._costs_of_each(shown)
+        begins = [i for i in range(len(shown)) if i == 0 or self._preferred(i) != self._preferred(i - 1)]
+        ends = [*begins[1:], len(shown)]
+        levels = [{"cost": shown[begin], "count": end - begin} for begin, end in zip(begins, ends, strict=False)]
+        if "levels" in self.answer and self.answer["levels"] != levels:
+            yield f"levels: expected {brief(levels)}, as the maps have these, got {brief(self.answer['levels'])}"
+
+    def _costs_of_each(self, shown: Sequence[Mapping[str, int]]) -> Iterator[str]:
+        """Each map costs what it is said to cost."""
+        listed = self.answer.get("maps")
+        for i, (said, counts) in enumerate(zip(listed if isinstance(listed, Sequence) else (), shown, strict=False)):
+            if isinstance(said, Mapping) and said.get("cost", counts) != counts:
+                yield f"maps[{i}].cost: expected {_text(counts)}, as the map has these, got {_text(said['cost'])}"
 
     def _least(self, cost: Any) -> dict[str, int]:
         """The counts of the first map. Where axioms are left out, clingo may count more than the map can show, so a larger claim is accepted."""

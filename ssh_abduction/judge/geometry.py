@@ -54,10 +54,9 @@ def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[R
     if not trace.has_displacements:
         return
     drifts = list(_drifts(trace))
-    returns = list(_returns(trace, ssh_map, theory, drifts[0][0]))
-    yield from _refused_alone(returns, drifts, theory)
+    yield from _refused_alone(list(_returns(trace, ssh_map, theory, drifts[0][0])), drifts, theory)
     if theory.joint > 1:
-        yield from _refused_together(returns, drifts, theory)
+        yield from _refused_together(list(_returns(trace, ssh_map, theory, drifts[0][0], of_arrivals=True)), drifts, theory)
 
 
 class _Filter:
@@ -157,14 +156,14 @@ def _drifts(trace: Trace) -> Iterator[tuple[_Filter, float]]:
         yield _Filter(trace, odometry, n * step, step / 2), max(abs(n) - 0.5, 0.0) ** 2 / BENDS_A_SIGMA**2
 
 
-def _returns(trace: Trace, ssh_map: SSHMap, theory: Theory, known: _Filter) -> Iterator[Return]:
-    """The returns of a map about which displacements say something."""
+def _returns(trace: Trace, ssh_map: SSHMap, theory: Theory, known: _Filter, of_arrivals: bool = False) -> Iterator[Return]:
+    """The returns of a map about which displacements say something; all of them, or those between the first steps of visits."""
     place = {s.id: s.place for s in ssh_map.dstates}
     size = min(len(trace), len(ssh_map.labels))
     labels = ssh_map.labels[:size]
     arrived = [t for t in range(size) if t == 0 or trace.actions[t - 1].kind != "turn"]
     groups: dict[tuple[int, int], list[int]] = defaultdict(list)
-    for t in range(size):
+    for t in arrived if of_arrivals else range(size):
         groups[3, labels[t]].append(t)
     for t in arrived if theory.level == "topological" else ():
         there = place.get(labels[t])

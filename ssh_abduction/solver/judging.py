@@ -25,7 +25,7 @@ SAMPLE = 1000
 # So many seconds the checker takes for a step, about, before the first check has shown it.
 A_STEP = 5e-6
 # Without these axioms a map shows one of several places, courses or headings of a dstate, so that the checker cannot judge it.
-UNSHOWN = frozenset({"one_place", "one_course", "one_heading"})
+UNSHOWN = frozenset({"one_place", "one_course", "one_heading", "gateway_heading"})
 
 
 class InternalError(SolverError):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ssh_abduction.asp.limits import Stop
-from ssh_abduction.engines.base import Cost, Found
+from ssh_abduction.engines.base import Cost, Found, cost_as_counted
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.result import Bound, Status
 from ssh_abduction.theory.theory import Theory
@@ -61,7 +61,5 @@ class Known:
 
     @property
     def best_cost(self) -> Cost | None:
-        """The counts of the best map; where axioms are left out, clingo may count more places or paths than the map can show."""
-        if self.best is None:
-            return None
-        return replace(Cost.of(self.best), **dict(zip(self._theory.priorities, self.cost, strict=True)))
+        """The counts of the best map."""
+        return None if self.best is None else cost_as_counted(self.best, self.cost, self._theory)

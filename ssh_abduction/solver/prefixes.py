@@ -9,10 +9,11 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import LimitError
+from ssh_abduction.asp.limits import LimitError, StageTimeError
 from ssh_abduction.engines.base import Engine, Found, Task
 from ssh_abduction.engines.refusing import first_accepted
-from ssh_abduction.engines.stepwise import StepEngine
+from ssh_abduction.engines.stepwise import StepEngine, paths_needed
+from ssh_abduction.judge.checker import turned
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
@@ -42,8 +43,9 @@ class Prefixes:
         """
         self.engine = engine
         self._task, self._known, self._judging, self._most, self._report = task, known, judging, most, report
-        self._whole = not task.speedups.prefixes
-        self.start = len(task.trace) if self._whole else FIRST_PREFIX
+        self._at_once = not task.speedups.prefixes
+        self._in_tolerance = task.theory.star == "gateways"
+        self.start = len(task.trace) if self._at_once else FIRST_PREFIX
 
     def go_on_with(self, engine: Engine, start: int) -> None:
         """Solve with another engine, from a prefix of so many steps on."""
@@ -63,7 +65,7 @@ class Prefixes:
             self._known.raise_lower(minimal.cost)
             replayed = self._replay(minimal.map)
             if self._predicts_all(minimal, replayed):
-                self._known.keep(minimal, replayed.labels)
+                self._known.keep(replace(minimal, map=self._whole(minimal.map, replayed)), replayed.labels)
             if self._known.best is not None and self._known.cost <= minimal.cost:  # a map of the whole trace, as cheap as any of the prefix
                 self._known.status = Status.OPTIMAL
                 return
@@ -82,7 +84,8 @@ class Prefixes:
 
     def _forbid(self, equalities: frozenset[Equality]) -> None:
         """Let no map have all of these equalities; where the engine cannot be told, another one goes on that can."""
-        if self.engine.forbid(equalities):
+        can_be_told = isinstance(self.engine, StepEngine) or all(equality.holds for equality in equalities)
+        if can_be_told and self.engine.forbid(equalities):
             return
         self.engine.settle()
         size, theory = self.engine.size, self._task.theory
@@ -94,15 +97,15 @@ class Prefixes:
         """A minimal map of the prefix by what clingo was told, or None. Better maps of the whole trace are kept on the way."""
         while True:
             minimal = None
-            for found in self.engine.improving_maps(self._known.cost if self._known.best and not self._whole else ()):
+            for found in self.engine.improving_maps(self._known.cost if self._known.best and not self._at_once else ()):
                 minimal = found
                 self._known.partial = found.map
                 replayed = self._replay(found.map)
                 if self._known.is_better(found) and self._predicts_all(found, replayed):
-                    self._known.keep(found, replayed.labels)
+                    self._known.keep(replace(found, map=self._whole(found.map, replayed)), replayed.labels)
                     self._task.watch.use_reserve()
                 self._report()
-                if not self._whole and self._known.lower is not None and found.cost <= self._known.lower:
+                if not self._at_once and self._known.lower is not None and found.cost <= self._known.lower:
                     break
             if not self._name_more_paths(minimal.cost if minimal else None):
                 return minimal
@@ -110,30 +113,17 @@ class Prefixes:
     def _predicts_all(self, found: Found, replayed: Replay) -> bool:
         """Whether a map of the prefix is one of the whole trace, that no evidence refuses."""
         whole = replayed.outcome is Outcome.PREDICTED
-        return whole and not self._judging.why_refused(replace(found.map, labels=replayed.labels))
+        return whole and not self._judging.why_refused(self._whole(found.map, replayed))
 
     def _name_more_paths(self, cost: tuple[int, ...] | None) -> bool:
         """Take a control with more names for paths, if the minimal cost found needs them. Says whether it was so."""
-        needed = self._paths_needed(cost)
+        needed = paths_needed(self._task, self.engine.size, cost)
         if needed <= self.engine.paths:
             return False
         size = self.engine.size
         self.engine = self.engine.with_paths(needed)
         self.engine.grow(size)
         return True
-
-    def _paths_needed(self, cost: tuple[int, ...] | None) -> int:
-        """How many names for paths it takes to be sure that no map of the prefix has another cost, or is missed at this one."""
-        theory = self._task.theory
-        segments = facts.most_paths(self._task.trace, theory, self.engine.size)
-        first = theory.priorities[0] if theory.priorities else None
-        if theory.level == "causal":
-            return 0
-        if cost is None or not self._task.speedups.path_names or first not in ("paths", "dstates"):
-            return segments
-        if first == "paths":
-            return cost[0]
-        return min(segments, cost[0] // (1 if "course_needs_travel" in theory.given_up else 2))
 
     def minimal_maps(self) -> Iterator[SSHMap]:
         """Every map of minimal cost, once, after those of the longest prefix that is needed have been seen to replay."""
@@ -147,7 +137,7 @@ class Prefixes:
                     break
                 self.engine.grow(self.engine.next_size(stuck))
                 self._name_more_paths(self._known.cost)
-        except LimitError:
+        except (LimitError, StageTimeError):
             yield from held  # they replay at the proven cost: they are minimal
             raise
         yield from held
@@ -167,7 +157,7 @@ class Prefixes:
                 if not streaming:
                     break
                 continue
-            whole = replace(found.map, labels=replayed.labels)
+            whole = self._whole(found.map, replayed)
             was_given = any(self._replay(found.map, size).outcome is Outcome.PREDICTED for size in streamed)
             if was_given or self._judging.why_refused(whole):
                 continue
@@ -184,6 +174,17 @@ class Prefixes:
         return stuck
 
     def _replay(self, ssh_map: SSHMap, known: int | None = None) -> Replay:
-        """The trace replayed over a map of a prefix, of which so many steps make links."""
+        """The trace replayed over a map of a prefix, of which so many steps make links. Where stars agree in tolerance, those of all steps have to."""
         log = self._task.log
-        return log.replay(ssh_map.labels, known, [s.place for s in ssh_map.dstates] if log.pairs else None)
+        replayed = log.replay(ssh_map.labels, known, [s.place for s in ssh_map.dstates] if log.pairs else None)
+        replays = replayed.outcome is Outcome.PREDICTED and len(ssh_map.labels) < len(replayed.labels)
+        if self._in_tolerance and replays and turned(self._task.trace, replace(ssh_map, labels=replayed.labels), self._task.theory) is None:
+            return Replay(replayed.labels[: len(ssh_map.labels)], Outcome.CONTRADICTED)
+        return replayed
+
+    def _whole(self, ssh_map: SSHMap, replayed: Replay) -> SSHMap:
+        """A map of a prefix as a map of the steps that are replayed over it. Where stars agree in tolerance, its headings are those that all of them allow."""
+        whole = replace(ssh_map, labels=replayed.labels)
+        if not self._in_tolerance or len(ssh_map.labels) == len(replayed.labels):
+            return whole
+        return turned(self._task.trace, whole, self._task.theory) or whole

@@ -43,23 +43,27 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from itertools import groupby
 from typing import Any
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import LimitError, StageTimeError, Stop, Watch, check_limit
 from ssh_abduction.asp.rules import check_rules
-from ssh_abduction.engines.base import AT_ONCE, Engine, Task
+from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Task, cost_as_counted
 from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import prefixes
+from ssh_abduction.solver.backbone import Rivals
 from ssh_abduction.solver.candidates import FRAMING_SHARE, Candidates
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
+from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.ranking import Ranking, noise_warning
-from ssh_abduction.solver.result import Bound, Progress, Seconds, Solution, Status
+from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solution, Status
+from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.steps.certificate import Basis
 from ssh_abduction.theory.evidence import evidence_of
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
@@ -70,6 +74,7 @@ FEW_STEPS = 24  # Traces up to this length skip names and greedy maps: solving t
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.
 ONE_MORE_SHARE = 0.1  # Or for such a share of the time that these took, if that is more, so that it is never a large part of the search.
 FRAME_AFTER = 1.0  # After so many seconds step by step a map with frames is sought, where the theory does not ask for one: most traces are solved by then.
+REASONING = 5.0  # For so many seconds it is sought what all minimal maps share, where the search took less and has no time limit.
 ALL = Speedups()
 
 
@@ -79,6 +84,7 @@ def solve(
     *,
     limit: float | None = None,
     maps: int = 100,
+    within: int = 0,
     memory: int | None = None,
     speedups: Speedups = ALL,
     on_progress: Callable[[Progress], None] | None = None,
@@ -90,6 +96,8 @@ def solve(
     limit        seconds of wall-clock time; when they are over, the best answer so far is returned
     maps         list at most so many maps; 0 lists all (take `Search` to stream them). Where there are so many, one more is sought for a second,
                  or a tenth of the time so far: only if that ends the answer is complete
+    within       list maps with up to so many dstates more than the least, too: for each number of dstates the maps that are minimal among those with just so
+                 many, in the order of these numbers. Where the theory prefers few paths or places first, these are counted instead
     memory       MiB of memory that the process may use at its peak before the search stops
     speedups     which speed-ups are on; none changes the answer
     on_progress  is told now and then how far the search is
@@ -100,7 +108,7 @@ def solve(
     """
     theory = checked_theory(theory).replace(**choices)
     theory.check_steps(checked_trace(trace))
-    search = Search(trace, theory, limit=limit, maps=maps, memory=memory, speedups=speedups, on_progress=on_progress)
+    search = Search(trace, theory, limit=limit, maps=maps, within=within, memory=memory, speedups=speedups, on_progress=on_progress)
     return search.solution(tuple(search))
 
 
@@ -109,6 +117,8 @@ class Search:
 
     Parameters as in `solve`, and, to go on when a trace has grown (`online.py`):
 
+    reasons  whether to find out, at the end, what all minimal maps share, where not all are listed. A share of the time limit is kept for that; without a
+             limit it takes as long as the search at most, or REASONING seconds, if that is more
     after    a search of this trace's first steps, which has ended: what it grounded and proved is taken over
     minimal  a map of this trace that costs what `after` proved: it is minimal, and only the others remain to be found
     """
@@ -120,9 +130,11 @@ class Search:
         *,
         limit: float | None = None,
         maps: int = 100,
+        within: int = 0,
         memory: int | None = None,
         speedups: Speedups = ALL,
         on_progress: Callable[[Progress], None] | None = None,
+        reasons: bool = False,
         after: Search | None = None,
         minimal: SSHMap | None = None,
     ) -> None:
@@ -131,6 +143,10 @@ class Search:
             raise SolverError(f"maps (--maps): expected a whole number, 0 for all, got {brief(maps)}")
         if maps < 0:
             raise SolverError(f"maps (--maps): expected 0 (all) or more, got {maps}")
+        if isinstance(within, bool) or not hasattr(within, "__index__") or within < 0:
+            raise SolverError(
+                f"within (--within): expected a whole number, 0 or more, got {brief(within)}; say how much more than the least a map may cost"
+            )
         check_limit("limit (--time-limit)", "seconds", limit)
         check_limit("memory (--memory-limit)", "MiB", memory)
         if on_progress is not None and not callable(on_progress):
@@ -142,6 +158,12 @@ class Search:
         self._first: SSHMap | None = None  # of the maps that were given
         self._basis: Basis | None = None  # of the certificate of the whole trace, where the search was stopped
         self._most = maps
+        self.within = int(within)
+        self._near: NearMinimal | None = None  # what lists maps that cost more than the least, once these are listed
+        self._levels: list[Level] = []
+        self._reasons = reasons
+        self._cost: tuple[int, ...] = ()  # of the map that was found last: the preferred counts
+        self._last: tuple[SSHMap, tuple[int, ...]] | None = None  # the map that was given last, and its preferred counts
         self._goes_on = after is not None
         self._asked_speedups = checked_speedups(speedups)
         self._on_progress = on_progress
@@ -149,6 +171,7 @@ class Search:
         self._task = Task.of(trace, self.theory, self._watch, speedups)
         self._known = Known(self.theory)
         self._judging = Judging(trace, self.theory)
+        self._rivals = Rivals(self._task, self._judging)
         self._candidates = Candidates(self._task, self._known, self._judging, self._report)
         engine = self._engine_after(after) if after else self._new_engine()
         self._prefixes = Prefixes(self._task, self._known, self._judging, engine, maps, self._report)
@@ -220,29 +243,52 @@ class Search:
         return self._known.count
 
     @property
+    def cost(self) -> Cost | None:
+        """What the map costs that was given last."""
+        return None if self._last is None else cost_as_counted(*self._last, self.theory)
+
+    @property
+    def backbone(self) -> Backbone | None:
+        """What the minimal maps share that are known so far; None where none is."""
+        return self._rivals.backbone
+
+    @property
     def prefix(self) -> int:
         """How many steps clingo was given."""
-        return self._prefixes.engine.size
+        return self._engine.size
 
     @property
     def grounding(self) -> Grounding:
         """Rules and atoms of the ground program that clingo solved last."""
-        return self._prefixes.engine.asker.grounding
+        return self._engine.asker.grounding
+
+    @property
+    def _engine(self) -> Engine:
+        """The engine that was asked last."""
+        return self._near.engine if self._near else self._prefixes.engine
 
     def __iter__(self) -> Iterator[SSHMap]:
-        found = self._found()
-        if self.theory.displacement == "use":
-            found = Ranking(self.trace).ranked(found, self.over)
-        for ssh_map in found:
-            self._first = self._first or ssh_map
-            yield ssh_map
+        return self._listed(Ranking(self.trace) if self.theory.displacement == "use" else None)
 
     def unranked(self) -> Iterator[SSHMap]:
-        """As by iteration, but in the order in which maps are found, and without how well they close."""
-        return self._found()
+        """As by iteration, but in the order in which maps are found, and without how well they close, which takes its time."""
+        return self._listed(None)
+
+    def _listed(self, ranking: Ranking | None) -> Iterator[SSHMap]:
+        for cost, level in groupby(self._found(), key=lambda _: self._cost):
+            for ssh_map in ranking.ranked(level, self.over) if ranking else level:
+                self._take_down(ssh_map, cost)
+                yield ssh_map
+
+    def _take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
+        """Remember the map that is given, and count it at its level."""
+        self._first, self._last = self._first or ssh_map, (ssh_map, cost)
+        if not self._levels or self._levels[-1].cost.preferred_by(self.theory) != cost:
+            self._levels.append(Level(cost_as_counted(ssh_map, cost, self.theory), 0))
+        self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
 
     def _found(self) -> Iterator[SSHMap]:
-        """The minimal maps, in the order in which they are found; or the best one known."""
+        """The maps, level by level, in the order in which they are found; or the best one known."""
         if self._begun:
             raise SolverError("search: expected to be iterated once, got a second time; make another Search")
         self._begun = True
@@ -250,9 +296,9 @@ class Search:
         try:
             self._make_first_map()
             self._find_minimum()
-            yield from self._list_minimal_maps()
+            yield from self._list_maps()
         except StageTimeError:
-            self._known.stopped = "maps limit"
+            self._known.stopped = "maps limit" if self.count == self._most else "time limit"
         except LimitError as limit:
             self._known.stopped = limit.reason
         except KeyboardInterrupt:
@@ -264,6 +310,8 @@ class Search:
             self._end_clingo()
         self._fall_back()
         yield from self._give_best_map()
+        if self._reasons:
+            self._reason()
 
     def _make_first_map(self) -> None:
         """Make a causal map at once, that clingo has to better."""
@@ -309,10 +357,13 @@ class Search:
 
             self._prefixes.go_on_with(FramelessEngine(self._task, labels), len(self.trace))
 
-    def _list_minimal_maps(self) -> Iterator[SSHMap]:
-        """Give the minimal maps, as many as were asked for, once they have passed the checker. The clock stands still while the caller has one."""
+    def _list_maps(self) -> Iterator[SSHMap]:
+        """Give the maps, as many as were asked for, once they have passed the checker. The clock stands still while the caller has one."""
         if self.status is Status.OPTIMAL:
-            for ssh_map in self._prefixes.minimal_maps():
+            ends = self._watch.reserve_begins if self._reasons else math.inf
+            ends = ends if ends > self._watch.elapsed() else math.inf
+            self._watch.end_stage_after(ends)
+            for ssh_map, cost in self._maps_by_cost():
                 if self._most and self.count == self._most:
                     self._known.stopped = "maps limit"
                     return
@@ -320,14 +371,32 @@ class Search:
                 # The first map is the best one: so the cost is its, also in the counts that the theory does not prefer.
                 self._known.best = self.best if self.count else ssh_map
                 self._known.count += 1
+                self._note(ssh_map, cost)
                 self._report()
                 self._watch.stop()
                 yield ssh_map
                 self._watch.start()
                 if self.count == self._most:
                     spent = self._watch.elapsed()
-                    self._watch.end_stage_after(spent + max(ONE_MORE, ONE_MORE_SHARE * spent))
+                    self._watch.end_stage_after(min(ends, spent + max(ONE_MORE, ONE_MORE_SHARE * spent)))
         self._known.complete = True
+
+    def _maps_by_cost(self) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
+        """The minimal maps, and behind them those that cost up to `within` more, each with its preferred counts."""
+        yield from ((ssh_map, self._known.cost) for ssh_map in self._prefixes.minimal_maps())
+        self._rivals.listed = True  # so no time is kept for reasoning
+        if not self._most or self.count < self._most:
+            self._watch.end_stage_after(math.inf)
+        if self.within and counted_first(self.theory):
+            self._prefixes.engine.settle()
+            self._near = NearMinimal(self._task, self._judging, self._most, self._report, self._prefixes.engine.asker)
+            yield from self._near.maps(self._known.cost, self.within)
+
+    def _note(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
+        """Note what a map costs that is found, and what it shares with the others."""
+        self._cost = cost
+        if self.status is Status.OPTIMAL and cost == self._known.cost:
+            self._rivals.add(ssh_map, cost)
 
     def _end_clingo(self) -> None:
         """End what is still under way, and take the bound that it leaves."""
@@ -335,6 +404,7 @@ class Search:
         self._watch.stop()
         self._prefixes.engine.settle()
         self._known.raise_bound(self._prefixes.engine.bound)
+        self._rivals.engine = None if self._rivals.listed or not self._prefixes.engine.intact else self._prefixes.engine
 
     def _fall_back(self) -> None:
         """Where the search was stopped: some map of the whole trace, if there was none, and a bound that takes no search."""
@@ -366,7 +436,18 @@ class Search:
         if self.status in (Status.FEASIBLE, Status.OPTIMAL) and not self.count and self.best is not None:
             self._judging.pass_map(self.best, self.prefix, self._watch.elapsed())
             self._known.count = 1
+            self._note(self.best, self._known.cost)
             yield self.best
+
+    def _reason(self) -> None:
+        """Find out what all minimal maps share, where not all are listed."""
+        self._watch.use_reserve()
+        self._watch.start()
+        spent = self._watch.elapsed()
+        self._watch.end_stage_after(spent + max(REASONING, spent) if self._watch.left() == math.inf else math.inf)
+        self._rivals.reason()
+        self._watch.end_stage_after(math.inf)
+        self._watch.stop()
 
     def interrupt(self) -> None:
         """End the search soon, with the best answer so far. For signal handlers and other threads."""
@@ -386,14 +467,14 @@ class Search:
 
     def solution(self, maps: tuple[SSHMap, ...] = ()) -> Solution:
         """How the search ended, with the maps that the caller kept."""
-        asker = self._prefixes.engine.asker
+        asker = self._engine.asker
         # Perhaps the search ended while the prefix was given to clingo: then what shows the bound is sought in all steps.
         ran_out = self.stopped not in (None, "maps limit")
-        basis = self._basis or self._basis_of(len(self.trace) if ran_out else self.prefix)
+        basis = self._basis or self._basis_of(len(self.trace) if ran_out else self._prefixes.engine.size)
         return Solution(
             status=self.status,
             maps=maps,
-            cost=self._known.best_cost,
+            cost=self._levels[0].cost if self._levels else self._known.best_cost,
             bound=self.bound,
             complete=self.complete,
             theory=self.theory,
@@ -403,6 +484,9 @@ class Search:
             seconds=Seconds(self._watch.elapsed(), asker.ground_seconds, asker.solve_seconds),
             stopped=self.stopped,
             partial=None if self.best else self._known.partial,
+            within=self.within,
+            levels=tuple(self._levels),
+            rivals=self._rivals,
             evidence=self._said_by_evidence(),
             odometry_warning=noise_warning(self._first.fit if self._first else None),
         )

@@ -43,7 +43,8 @@ class Replay:
 
 def observation(step: Step, theory: Theory) -> tuple[object, object]:
     """What the axioms read at a step: the view, and the star where the theory uses stars. Where the theory does not say how stars are turned
-    (star=pattern), all four rotations of a star are the same observation.
+    (star=pattern), all four rotations of a star are the same observation. Where stars agree in tolerance only (star=gateways), none tells two dstates apart
+    by itself.
 
     By functional_view and the axioms of the stars, a dstate has one observation.
     """

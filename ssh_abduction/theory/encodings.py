@@ -9,7 +9,13 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
-FIRST = ("causal", "topological", "boundary", "star")  # each needs those before it; files that are added come after them, by name
+FIRST = (
+    "causal",
+    "topological",
+    "boundary",
+    "star",
+    "gateways",
+)  # each needs those before it; files that are added come after them, by name
 _AXIOM = re.compile(r"^% @axiom\((?P<name>\w+)\) (?:(?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if (?P<when>.+))?|(?P<alone>.+))$")
 _WHEN = re.compile(r"^% @when (?P<when>.+)$")
 _KEEPS = re.compile(r"^% @keeps (?P<names>.+)$")

@@ -159,6 +159,7 @@ FRAMES = PLACES | {
     "one_dstate_per_heading",
     "path_goes_straight",
 }
+GATEWAYS = frozenset({"gateway_frame", "gateway_heading", "gateway_turn", "gateway_dstate", "gateway_path"})
 NOTHING: frozenset[str] = frozenset()
 # The axioms that a map of a trace still satisfies when it is cut to some first steps, and that speak of nothing but links, observations and pairs of steps.
 SURVIVE_A_CUT = FRAMES | {
@@ -170,12 +171,13 @@ SURVIVE_A_CUT = FRAMES | {
     "side_of_branch, excusable",
     "sides_disjoint",
     "path_between_sides",
+    "planar",
     "asserted",
     "asserted same",
     "one_pose",
 }
 # Kinds of evidence that say nothing but which steps are not one dstate, or not at one place, and which labels go not together.
-PAIRS_OF_STEPS = ("asserted", "one_pose")
+PAIRS_OF_STEPS = ("asserted", "one_pose", "planar")
 
 TABLE = (
     Speedup(
@@ -185,6 +187,14 @@ TABLE = (
         _keeps_headings,
         ONE_OF_EACH,
         lambda: SURVIVE_A_CUT,
+    ),
+    Speedup(
+        "prefixes in tolerance",
+        "prefixes",
+        "The same where stars agree in tolerance: a map that is replayed has to fit the stars of all steps.",
+        lambda theory: theory.star == "gateways",
+        ONE_OF_EACH | {"gateway_heading"},
+        lambda: SURVIVE_A_CUT | GATEWAYS,
     ),
     Speedup("path_names", "path_names", "Begin with few names for paths.", _has_paths, TRAVELS_AND_TURNS, EVERY),
     Speedup(

@@ -27,7 +27,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "level": ("causal", "topological"),
     "boundary": ("none", "strict", "defeasible"),
     "path_order": ("partial", "total"),
-    "star": ("auto", "none", "pattern", "frame"),
+    "star": ("auto", "none", "pattern", "frame", "gateways"),
     "displacement": ("auto", "none", "use"),
 }
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
@@ -47,6 +47,7 @@ SPOKEN_FOR = {
     "symmetric_sides",
     "next_place",
     "all_on_paths",
+    "planar",
     "prefer",
     "without",
     "rules",
@@ -69,11 +70,14 @@ class Theory:
     next_place       a travel leads to the next place of its path
     all_on_paths     every dstate is along a path, even one that no travel starts or ends at
     star             the openings seen at a place: none, pattern (agree up to rotation), frame (agree when turned by the
+                     heading, and paths go straight on), gateways (the same in any directions, in tolerance); auto is frame where
+                     the trace has stars, and none elsewhere; frame is gateways where stars or turns do not fit right angles
                      heading, and paths go straight on); auto is frame where the trace has stars, and none elsewhere
     displacement     whether displacements are evidence: none, use; auto uses them where the trace has any
     reject           the probability, at most, that displacements refuse a true map of the trace
     joint            so many returns are tested together, at most: 1 or 2
     returns          how many returns of the trace may be true, among which `reject` is shared; 0 counts them in the trace
+    planar           paths meet at places only: the map can be drawn in the plane, with turns right to the right, without a crossing
     prefer           what is minimised, first to last: dstates, paths, places, and with boundary=defeasible excuses, which go first
                      unless they are named; what is not named is not minimised. auto is dstates,places,paths where displacements are used,
                      else dstates,paths,places
@@ -90,7 +94,7 @@ class Theory:
     path_order: Literal["partial", "total"] = "total"
     next_place: bool = False
     all_on_paths: bool = False
-    star: Literal["auto", "none", "pattern", "frame"] = "auto"
+    star: Literal["auto", "none", "pattern", "frame", "gateways"] = "auto"
     displacement: Literal["auto", "none", "use"] = "auto"
     reject: float = 0.001
     joint: int = 2
@@ -98,6 +102,7 @@ class Theory:
     prefer: tuple[Count, ...] = AUTO
     without: tuple[str, ...] = ()
     rules: tuple[Rules, ...] = ()
+    planar: bool = False
     same: tuple[Pair, ...] = ()
     different: tuple[Pair, ...] = ()
     elsewhere: tuple[Pair, ...] = ()
@@ -229,10 +234,10 @@ class Theory:
     def with_frames(self) -> Theory | None:
         """A theory in which places have frames and fewest dstates come first. Its maps, without their headings, are maps of this theory, too.
 
-        None for the causal level. The trace need not have stars. The maps satisfy all axioms of this theory: their paths are totally
+        None for the causal level, and for stars of any gateways. The trace need not have stars. The maps satisfy all axioms of this theory: their paths are totally
         ordered; the axioms of sides, if there are any, hold without excuses; and stars that agree in a frame are one pattern.
         """
-        if self.level == "causal":
+        if self.level == "causal" or self.star == "gateways":
             return None
         boundary = "none" if self.boundary == "none" else "strict"
         rest = [count for count in self.priorities if count in ("paths", "places")]
@@ -250,6 +255,8 @@ class Theory:
         if star != "none" and not trace.has_stars:
             mend = f"add them to the steps, or take {_choice('star', 'none')}"
             raise TheoryError(f"star: expected a trace with stars for star={star}, got none; {mend}")
+        if star == "frame" and not trace.in_quarters:
+            star = "gateways"
         displacement = self.displacement
         if displacement == "auto":
             displacement = "use" if trace.has_displacements else "none"
@@ -283,6 +290,13 @@ class Theory:
             return
         if step.star is None:
             raise TraceError(f"{where}: star: expected one, as other steps have stars; add it, or take {_choice('star', 'none')}")
+        if self.star == "gateways":
+            if step.gateways and (near := step.gateways.too_near):
+                raise TraceError(
+                    f"{where}: star: expected gateways that their spreads tell apart, got {near[0]:g} and {near[1]:g} degrees; "
+                    f"give smaller spreads, or merge the two"
+                )
+            return
         try:
             _ = step.openings
         except TraceError as error:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.theory.evidence.asserted import Asserted
 from ssh_abduction.theory.evidence.displacement import Displacement
+from ssh_abduction.theory.evidence.planar import Planar
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 from ssh_abduction.trace import Trace
@@ -23,9 +24,9 @@ from ssh_abduction.trace import Trace
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
-KINDS: tuple[type[Evidence], ...] = (Asserted, Displacement)
+KINDS: tuple[type[Evidence], ...] = (Asserted, Displacement, Planar)
 
-__all__ = ["KINDS", "NO_PAIRS", "Asserted", "Displacement", "Equality", "Evidence", "Pairs", "evidence_of", "pairs_of"]
+__all__ = ["KINDS", "NO_PAIRS", "Asserted", "Displacement", "Equality", "Evidence", "Pairs", "Planar", "evidence_of", "pairs_of"]
 
 
 def evidence_of(theory: Theory) -> tuple[Evidence, ...]:

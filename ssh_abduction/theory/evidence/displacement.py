@@ -6,7 +6,7 @@ to the other closes off by something; how likely that is, its covariance says (`
 *One return* says nothing of any other, so it is known before the search which ones are refused: they are pairs of steps that are not at one place, or
 not one dstate, and prune the domains of every engine.
 
-*Two returns* can be refused only together with each other if their loops share displacements. They are looked for in each answer.
+*Two returns* are tested together if both are of the first steps of visits, and their loops share displacements. What is refused is looked for in each answer.
 
 *How often a true map is refused.* Each return is tested, and a true map has many. So a return is refused at a p-value that is half of `reject` shared among all
 returns which may be true, and a set of two at the other half shared among all sets of two of these: then a true map is refused with a probability of `reject` at
@@ -247,8 +247,8 @@ class Returns:
                 yield from ((s, t) for i in others for s in range(i, end[i]) if views[s] == views[t])
 
     def _returns_of(self, labels: tuple[int, ...], places: tuple[int | None, ...], since: int = 0) -> Steps:
-        """The returns of a map about which displacements say something and that end at a step from `since` on, as rows by last step: pairs of visits at one
-        place, and pairs of steps at one dstate.
+        """The returns of a map about which displacements say something and that end at a step from `since` on, as rows by last step: pairs of visits that
+        begin at one place, or at one dstate.
 
         labels  the dstate of each step
         places  the place of each dstate
@@ -257,10 +257,9 @@ class Returns:
 
         at_dstate: dict[int, list[int]] = defaultdict(list)
         at_place: dict[int | None, list[int]] = defaultdict(list)
-        for t, label in enumerate(labels):
-            at_dstate[label].append(t)
         for t in self.arrivals:
             if t < len(labels):
+                at_dstate[labels[t]].append(t)
                 at_place[places[labels[t]]].append(t)
         at_place.pop(None, None)
         found = []

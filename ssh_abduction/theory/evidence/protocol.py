@@ -15,11 +15,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Equality:
-    """That two steps are at one dstate, or at one place."""
+    """That two steps are at one dstate, or at one place; or that they are not."""
 
     first: int
     second: int
     of: str = "dstate"
+    holds: bool = True
 
 
 class Evidence(Protocol):
@@ -42,7 +43,7 @@ class Evidence(Protocol):
         ...
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        """A small set of equalities of a map of the first steps that cannot all hold, whatever the map; None if there is none.
+        """A small set of equalities of a map of the first steps, and of what is not equal (`holds` is False), that cannot all hold, whatever the map; None if there is none.
 
         since  the map of the steps before this one is known to be a map of these that is not refused, so that it need not be asked about again
         """

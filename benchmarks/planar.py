@@ -1,0 +1,186 @@
+"""Street maps in the plane, with streets at any angles: a robot drives through them, and sees the bearings of the gateways.
+
+A world is a graph of networkx whose nodes have a position `at`, as complex numbers with x to the right and y up; its edges are straight streets.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+import random
+from collections.abc import Container
+from dataclasses import dataclass
+
+import networkx as nx
+
+from ssh_abduction import Trace
+from ssh_abduction.trace import Action
+
+STRAIGHT = 20.0  # degrees: two streets that are at most so far from one line are one path
+
+
+@dataclass(frozen=True)
+class Tour:
+    """What a robot saw and did, and where it was: the place and the direction that it faced, for each step."""
+
+    trace: Trace
+    truth: tuple[tuple[object, int], ...]
+
+    @property
+    def labels(self) -> tuple[int, ...]:
+        """The true dstate of each step, numbered by first visit."""
+        number: dict[tuple[object, int], int] = {}
+        return tuple(number.setdefault(state, len(number)) for state in self.truth)
+
+    @property
+    def places(self) -> int:
+        """How many places were visited."""
+        return len({place for place, _ in self.truth})
+
+
+def world(at: dict[object, complex], streets: list[tuple[object, object]]) -> nx.Graph:
+    """A world of these places and streets."""
+    graph = nx.Graph(streets)
+    nx.set_node_attributes(graph, at, "at")
+    return graph
+
+
+def triangle() -> nx.Graph:
+    """Three places with corners of 60 degrees."""
+    return world({k: cmath.rect(1, math.radians(120 * k)) for k in range(3)}, [(0, 1), (1, 2), (2, 0)])
+
+
+def hexagon() -> nx.Graph:
+    """Six places with bends of 120 degrees."""
+    return world({k: cmath.rect(1, math.radians(60 * k)) for k in range(6)}, [(k, (k + 1) % 6) for k in range(6)])
+
+
+def honeycomb(rows: int, columns: int) -> nx.Graph:
+    """Junctions of three streets, 120 degrees from each other."""
+    graph = nx.hexagonal_lattice_graph(rows, columns)
+    nx.set_node_attributes(graph, {node: complex(*pos) for node, pos in graph.nodes(data="pos")}, "at")
+    return graph
+
+
+def triangles(rows: int, columns: int) -> nx.Graph:
+    """A lattice of triangles: junctions of up to six streets, 60 degrees from each other."""
+    graph = nx.triangular_lattice_graph(rows, columns)
+    nx.set_node_attributes(graph, {node: complex(*pos) for node, pos in graph.nodes(data="pos")}, "at")
+    return graph
+
+
+def wheel(spokes: int) -> nx.Graph:
+    """A hub with so many spokes, and a ring road around it."""
+    rim = {k: cmath.rect(1, 2 * math.pi * k / spokes) for k in range(spokes)}
+    return world({"hub": 0j, **rim}, [("hub", k) for k in rim] + [(k, (k + 1) % spokes) for k in rim])
+
+
+def junction(*directions: float) -> nx.Graph:
+    """A hub, and a dead end in each of these directions, in degrees."""
+    ends = {k: cmath.rect(1, math.radians(d)) for k, d in enumerate(directions)}
+    return world({"hub": 0j, **ends}, [("hub", k) for k in ends])
+
+
+def scattered(places: int, rng: random.Random) -> nx.Graph:
+    """Places anywhere, and streets between them at any angles that are at least 40 degrees apart at each place; no two streets cross."""
+    from scipy.spatial import Delaunay
+
+    while True:
+        points = [complex(rng.random(), rng.random()) for _ in range(places)]
+        edges = {frozenset(map(int, (s[i], s[i - 1]))) for s in Delaunay([(z.real, z.imag) for z in points]).simplices for i in range(3)}
+        graph: nx.Graph = nx.Graph()
+        graph.add_nodes_from((k, {"at": z}) for k, z in enumerate(points))
+        for a, b in rng.sample(sorted(map(sorted, edges)), len(edges)):
+            graph.add_edge(a, b)
+            if any(_crowded(graph, place) for place in (a, b)):
+                graph.remove_edge(a, b)
+        if nx.is_connected(graph):
+            return graph
+
+
+def _crowded(graph: nx.Graph, place: object) -> bool:
+    """Whether two directions at a place, of streets or straight opposite of them, are hard to tell apart."""
+    ways = [_direction(graph, place, there) for there in graph[place]]
+    for i, a in enumerate(ways):
+        for b in ways[:i]:
+            apart = abs((a - b + 180) % 360 - 180)
+            if apart < 45 or 180 - 45 < apart < 180 - 5:
+                return True
+    return False
+
+
+def _direction(graph: nx.Graph, here: object, there: object) -> float:
+    """The direction of a street, in degrees clockwise from up."""
+    way = graph.nodes[there]["at"] - graph.nodes[here]["at"]
+    return 90 - math.degrees(cmath.phase(way))
+
+
+def _aligned(graph: nx.Graph, place: object, facing: float) -> float:
+    """The direction of a robot that has come to a place, and turns to the street that goes straight on, if there is one."""
+    return next(
+        (way for there in graph[place] if abs(((way := _direction(graph, place, there)) - facing + 180) % 360 - 180) <= STRAIGHT), facing
+    )
+
+
+def drive(
+    graph: nx.Graph,
+    start: object,
+    towards: object,
+    steps: int,
+    rng: random.Random,
+    noise: float = 0.0,
+    unseen: bool = False,
+    landmarks: Container[object] = (),
+) -> Tour:
+    """A tour of so many steps: at each place the robot goes on along a street that it has been along least often. Its views are the bearings of the gateways, to ten degrees.
+
+    noise      degrees that each bearing of a star may be off
+    unseen     whether gateways behind the robot are not observed; each is then logged where it is, but as unknown
+    landmarks  places that the views tell, too
+    """
+    here, facing = start, _direction(graph, start, towards)
+    views: list[str] = []
+    actions: list[Action] = []
+    stars: list[list[object]] = []
+    truth: list[tuple[object, int]] = []
+    driven: dict[object, int] = {}
+
+    def look() -> None:
+        bearings = sorted((_direction(graph, here, there) - facing) % 360 for there in graph[here])
+        seen: list[object] = []
+        for bearing in bearings:
+            off = bearing + rng.uniform(-noise, noise)
+            hidden = unseen and 100 < bearing < 260
+            seen.append({"bearing": round(off, 2) % 360, "open": None} if hidden else round(off, 2) % 360)
+        stars.append(seen)
+        views.append(" ".join([*map(str, sorted(round(b / 10) % 36 for b in bearings)), *([f"at {here}"] if here in landmarks else [])]))
+        truth.append((here, round(facing / 5) % 72))
+
+    look()
+    ahead: object = towards
+    while len(views) < steps:
+        if ahead is not None:
+            driven[frozenset((here, ahead))] = driven.get(frozenset((here, ahead)), 0) + 1
+            facing = _direction(graph, here, ahead)
+            here, ahead = ahead, None
+            facing = _aligned(graph, here, facing)
+            actions.append(Action.of("travel"))
+            look()
+            continue
+        ways = list(graph[here])
+        ahead = min(ways, key=lambda there: (driven.get(frozenset((here, there)), 0), rng.random()))
+        turn = (_direction(graph, here, ahead) - facing) % 360
+        if min(turn, 360 - turn) <= STRAIGHT:
+            continue
+        if abs(turn - 180) <= STRAIGHT:
+            actions.append(Action.of("around"))
+        else:
+            side = "right" if turn < 180 else "left"
+            others = sorted((_direction(graph, here, there) - facing) % 360 for there in ways)
+            beside = [b for b in others if STRAIGHT < b < 360 - STRAIGHT]
+            order = beside if side == "right" else beside[::-1]
+            number = 1 + min(range(len(order)), key=lambda k: abs(order[k] - turn))
+            actions.append(Action.of({"name": f"{side} {number}", "kind": "turn", "turn": side, "gateway": number}))
+        facing = _direction(graph, here, ahead)
+        look()
+    return Tour(Trace.from_steps(views, actions, stars=stars), tuple(truth))

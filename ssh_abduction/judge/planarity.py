@@ -1,0 +1,204 @@
+"""Judges whether the edges of a map can be drawn in the plane without a crossing.
+
+>>> there_back_and_there = [(0, 1), (2, 3), (4, 5)]
+>>> edges = Edges(there_back_and_there, [], {0: 0, 1: 1, 2: 1, 3: 0, 4: 0, 5: 1})
+>>> edges.can_be_drawn_by({0: 1, 1: 1, 2: 0, 3: 2, 4: 3, 5: 3})
+True
+>>> edges.can_be_drawn_by({0: 1, 1: 1, 2: 2, 3: 2, 4: 3, 5: 2})
+False
+
+A travel leads from the arm ahead of one dstate to the arm behind another one. Arms lie around a place in some order, and some of them may be one gateway. Where places
+have frames this module makes all headings that turns and stars leave open, and tries them, place by place: with the right ones each gateway is joined to one
+other, and V - E + F = 2 for each connected part (Heffter, Edmonds; see Mohar & Thomassen, Graphs on Surfaces, 2001). Without frames it makes the orders that
+sides leave open, and shares with the evidence what seeks a drawing with them (theory/drawing.py), which the tests compare with networkx and with a brute force.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeAlias
+
+from ssh_abduction.star import Openings
+from ssh_abduction.theory.drawing import can_be_drawn
+
+Arm: TypeAlias = tuple[int, int]  # of a dstate, ahead (1) or behind (-1)
+Option: TypeAlias = Mapping[Arm, int]  # the position of each arm around its place, clockwise; those of one gateway have one
+
+QUARTERS = {"right": 1, "around": 2, "left": 3}
+
+
+class Edges:
+    """The travels and turns of a map.
+
+    travels   from a dstate to a dstate
+    turns     a dstate, which way (right, left, around), and the dstate that is faced then; turns between places tell nothing
+    place_of  the place of each dstate
+    """
+
+    def __init__(self, travels: Iterable[tuple[int, int]], turns: Iterable[tuple[int, str, int]], place_of: Mapping[int, int]) -> None:
+        self.travels = list(travels)
+        self.place_of = place_of
+        self.turns = [(s, turn, t) for s, turn, t in turns if place_of[s] == place_of[t]]
+        self._used = {arm for s, t in self.travels for arm in ((s, 1), (t, -1))}
+        self._at: dict[int, list[int]] = defaultdict(list)  # the dstates at each place
+        for s, p in place_of.items():
+            self._at[p].append(s)
+
+    def can_be_drawn_by(self, headings: Mapping[int, int]) -> bool:
+        """Whether these slots of a frame of four, one for each dstate, make a drawing without a crossing."""
+        return self._is_drawing({(s, side): (headings[s] + (1 - side)) % 4 for s in self.place_of for side in (1, -1)})
+
+    def can_be_drawn_in_frames(self, stars: Mapping[int, Iterable[Openings]], *, turned: bool, distinct: bool) -> bool:
+        """Whether some headings make such a drawing.
+
+        stars     seen at each dstate; those at one place agree in its frame
+        turned    turns rotate the heading
+        distinct  no two dstates face one slot
+        """
+        options: list[list[Option]] = []
+        for here in self._at.values():
+            turns = [(s, QUARTERS[turn], t) for s, turn, t in self.turns if s in here] if turned else []
+            headings: list[dict[int, int]] = [{here[0]: 0}]
+            for t in here[1:]:
+                headings = [{**faced, t: k} for faced in headings for k in range(4) if not (distinct and k in faced.values())]
+                headings = [faced for faced in headings if all(_is_turned(faced, turn) for turn in turns)]
+            found: dict[tuple[int, ...], Option] = {}
+            for faced in headings:
+                if len({tuple(star[(k - faced[s]) % 4] for k in range(4)) for s in here for star in stars.get(s, ())}) <= 1:
+                    option = {(s, side): (faced[s] + (1 - side)) % 4 for s in here for side in (1, -1) if (s, side) in self._used}
+                    first = next(iter(option.values()), 0)
+                    found.setdefault(tuple((k - first) % 4 for k in option.values()), option)
+            options.append(list(found.values()))
+        return self._some_option_draws(options)
+
+    def can_be_drawn(self, *, crossing: bool) -> bool:
+        """Whether some orders of gateways make such a drawing, where turns tell no more than sides.
+
+        crossing  a turn leads from one edge to another that crosses it, rather than to a branch of it
+        """
+        one = self._gateways()
+        if one is None:
+            return False
+        at_edge = {s for s, _ in self._used}
+        while more := {x for s, turn, t in self.turns if turn == "around" and {s, t} & at_edge for x in (s, t)} - at_edge:
+            at_edge |= more
+        told: dict[int, list[list[Arm]]] = defaultdict(list)  # gateways of each place that are met one after another, clockwise
+        for s, turn, t in self.turns:
+            if turn != "around" and {s, t} <= at_edge:
+                side = 1 if turn == "right" else -1
+                arms = [(s, 1), (t, side), (s, -1), (t, -side)]
+                told[self.place_of[s]].append([one[arm] for arm in arms if crossing or arm != (t, -1)])
+        edges = {frozenset(((self.place_of[s], one[s, 1]), (self.place_of[t], one[t, -1]))) for s, t in self.travels}
+        ends = [choose(edge, key=repr) for edge in edges for choose in (min, max)]
+        orders = {p: _orders(sorted({arm for arms in told[p] for arm in arms}, key=repr), told[p]) for p in self._at}
+
+        def allows(place: int, some: Sequence[int]) -> bool:
+            return any(_goes_round(order, list(dict.fromkeys(ends[end][1] for end in some))) for order in orders[place])
+
+        return can_be_drawn([(p, q) for (p, _), (q, _) in zip(ends[::2], ends[1::2], strict=True)], allows)
+
+    def _gateways(self) -> dict[Arm, Arm] | None:
+        """For each arm, one that stands for its gateway: who turns around faces what was behind, and a gateway leads to one gateway. None if it leads to two places."""
+        one = {(s, side): (s, side) for s in self.place_of for side in (1, -1)}
+
+        def join(first: Arm, second: Arm) -> bool:
+            changed = False
+            for turned in (1, -1):
+                old, new = one[first[0], turned * first[1]], one[second[0], turned * second[1]]
+                if old != new:
+                    changed = True
+                    one.update({arm: new for arm, gateway in one.items() if gateway == old})
+            return changed
+
+        for s, turn, t in self.turns:
+            if turn == "around":
+                join((s, 1), (t, -1))
+        changed = True
+        while changed:
+            changed = False
+            beyond: dict[Arm, Arm] = {}
+            for s, t in self.travels:
+                for here, there in (((s, 1), (t, -1)), ((t, -1), (s, 1))):
+                    other = beyond.setdefault(one[here], there)
+                    if self.place_of[other[0]] != self.place_of[there[0]]:
+                        return None
+                    changed = join(other, there) or changed
+        return one
+
+    def _some_option_draws(self, options: list[list[Option]]) -> bool:
+        """Whether some choice of an option for each place makes a drawing. Where part of a choice does not, nothing is added to it."""
+        settled = {arm: k for some in options if len(some) == 1 for arm, k in some[0].items()}
+        others = sorted((some for some in options if len(some) != 1), key=len)
+        if not self._is_drawing(settled):
+            return False
+        choices = [(0, settled)]
+        while choices:
+            level, chosen = choices.pop()
+            if level == len(others):
+                return True
+            choices += [(level + 1, more) for option in others[level] if self._is_drawing(more := {**chosen, **option})]
+        return False
+
+    def _is_drawing(self, position: Option) -> bool:
+        """Whether the travels both arms of which have positions join each gateway to one other, with V - E + F = 2 for each connected part."""
+        joined = {
+            frozenset(((self.place_of[s], position[s, 1]), (self.place_of[t], position[t, -1])))
+            for s, t in self.travels
+            if (s, 1) in position and (t, -1) in position
+        }
+        beyond: dict[tuple[int, int], tuple[int, int]] = {}
+        for edge in joined:
+            first, *_, last = *edge, *edge
+            for here, there in ((first, last), (last, first)):
+                if beyond.setdefault(here, there) != there:
+                    return False
+        around: dict[int, list[tuple[int, int]]] = defaultdict(list)
+        for gateway in sorted(beyond):
+            around[gateway[0]].append(gateway)
+        after = {gateway: gateways[i - 1] for gateways in around.values() for i, gateway in enumerate(gateways)}  # counterclockwise
+        places = len(around) + sum(len(edge) == 1 for edge in joined)  # an edge that leads back to its gateway turns at a place of its own
+        return places - len(joined) + _cycles({gateway: after[other] for gateway, other in beyond.items()}) == 2 * _parts(around, beyond)
+
+
+def _cycles(following: Mapping[tuple[int, int], tuple[int, int]]) -> int:
+    left, cycles = set(following), 0
+    while left:
+        cycles += 1
+        here = left.pop()
+        while (here := following[here]) in left:
+            left.remove(here)
+    return cycles
+
+
+def _parts(around: Mapping[int, Sequence[tuple[int, int]]], beyond: Mapping[tuple[int, int], tuple[int, int]]) -> int:
+    left, parts = set(around), 0
+    while left:
+        parts += 1
+        queue = [left.pop()]
+        while queue:
+            new = {beyond[gateway][0] for gateway in around[queue.pop()]} & left
+            left -= new
+            queue.extend(new)
+    return parts
+
+
+def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
+    """Whether a turn rotates the heading, as far as headings are there already."""
+    s, quarters, t = turn
+    return s not in faced or t not in faced or (faced[s] + quarters - faced[t]) % 4 == 0
+
+
+def _goes_round(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
+    """Whether what is there already of some gateways, which have to be different, comes in this order going round once."""
+    there = [order.index(gateway) for gateway in told if gateway in order]
+    return len(set(told)) == len(told) and sum(j < i for i, j in zip(there, [*there[1:], *there[:1]], strict=True)) <= 1
+
+
+def _orders(gateways: Sequence[Arm], told: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
+    """The clockwise orders of some gateways, the first one first, that agree with what is told."""
+    orders: list[tuple[Arm, ...]] = [()]
+    for gateway in gateways:
+        longer = ((*order[:gap], gateway, *order[gap:]) for order in orders for gap in range(min(1, len(order)), len(order) + 1))
+        orders = [order for order in longer if all(_goes_round(order, some) for some in told)]
+    return orders

@@ -1,0 +1,226 @@
+"""What all minimal maps of a trace share, without listing them.
+
+Some minimal maps are known. What they share is in doubt: two steps that are one in all of them need not be one in all minimal maps, and two steps that are
+one in none of them may be one in another. So clingo is asked for a minimal map in which any of these doubts holds. If there is one, it is taken in, and fewer
+doubts are left; if there is none, what is shared is proven. This is brave and cautious reasoning in one, and each answer is a map that can be looked at.
+
+*Prefixes.* It is asked for maps of a prefix that cost at most as much as minimal maps of the trace. The cut of a minimal map is among these
+(`solver/search.py`). So a map that is found and replays to the end is minimal; where one does not, the prefix grows. Where none is left in which a doubt about
+steps of the prefix holds, the classes of steps that are one in all known maps are one in all minimal maps. As actions are deterministic, these classes
+replay like a map: where they replay to the end, each further step is in the class of a step of the prefix in every minimal map, and so nothing about it is in
+doubt. Where they do not, the prefix grows.
+
+*Labels.* An engine that settles dstates before places and paths has all labels of minimal maps, which are few, even where there are thousands of maps. Then
+dstates are not in doubt, and what is in doubt about places and paths is asked for each labels in turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from itertools import combinations
+
+from ssh_abduction.asp.limits import LimitError, StageTimeError
+from ssh_abduction.engines.base import Engine, Task
+from ssh_abduction.engines.doubts import Doubt, Settled
+from ssh_abduction.engines.stepwise import StepEngine, paths_needed
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.sharing import Backbone, Sharing
+from ssh_abduction.steps.log import Outcome, Replay
+from ssh_abduction.theory.evidence import Equality
+
+# Without these axioms a dstate may be at several places, or along several courses, of which a map shows one.
+SHOWN_ONCE = frozenset({"one_place", "one_course"})
+
+
+class Rivals:
+    """The minimal maps of a trace, as far as they are known, and what it takes to find out about the others.
+
+    sharing  what the known ones share
+    listed   whether these are all
+    engine   what they were asked of
+    """
+
+    def __init__(self, task: Task, judging: Judging) -> None:
+        """No minimal map is known yet. The task is that of the search which lists them."""
+        self.sharing = Sharing()
+        self.listed = False
+        self.engine: Engine | None = None
+        self._task, self._judging = task, judging
+        self._cost: tuple[int, ...] = ()
+        self._proven = False
+        self._reasoned = False
+
+    def __getstate__(self) -> dict[str, object]:
+        """What is known goes to other processes; what it takes to find out more does not."""
+        return {"sharing": self.sharing, "listed": self.listed, "engine": None, "_proven": self._proven, "_reasoned": True}
+
+    def add(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
+        """Take in a minimal map, and what it costs: the preferred counts, first to last."""
+        self._cost = cost
+        self.sharing.absorb(ssh_map)
+
+    def reason(self, *, anew: bool = False) -> None:
+        """Find out, once, what all minimal maps share, unless all are listed. It ends when a limit of the search is over, or with Ctrl-C.
+
+        anew  whether the limits begin anew, as the search is over
+        """
+        if self.listed or self._reasoned or not self.sharing.maps:
+            return
+        self._reasoned = True
+        if anew:
+            self._task.watch.begin_anew()
+        with suppress(LimitError, StageTimeError, KeyboardInterrupt):
+            self._proven = prove_backbone(self._task, self._judging, self._cost, self.sharing, self.engine)
+        self.engine = None
+
+    @property
+    def backbone(self) -> Backbone | None:
+        """What the minimal maps share that are known; None where none is."""
+        return self.sharing.backbone(proven=self.listed or self._proven) if self.sharing.maps else None
+
+
+def prove_backbone(task: Task, judging: Judging, cost: tuple[int, ...], sharing: Sharing, engine: Engine | None = None) -> bool:
+    """Let minimal maps be taken in until those share only what all minimal maps of the trace share. Raises LimitError.
+
+    cost     what minimal maps cost: the preferred counts, first to last
+    sharing  what one minimal map or more share
+    engine   what found that they are minimal, if that is still at hand
+
+    Returns whether that is proven. It cannot be for a theory in which a dstate may be at several places, or along several courses.
+    """
+    if SHOWN_ONCE & task.theory.given_up:
+        return False
+    reasoning = _Reasoning(task, judging, cost, sharing)
+    if engine is None or not reasoning.settle_labels(engine):
+        reasoning.settle_steps()
+    return True
+
+
+class _Reasoning:
+    """Asks for minimal maps in which other steps are one than in those that are known."""
+
+    def __init__(self, task: Task, judging: Judging, cost: tuple[int, ...], sharing: Sharing) -> None:
+        self._task, self._judging, self._cost, self._sharing = task, judging, cost, sharing
+
+    def settle_labels(self, engine: Engine) -> bool:
+        """Take in maps, for each labels of minimal maps, until nothing is in doubt. Returns False where that cannot be done with this engine."""
+        forbidden = set[frozenset[Equality]]()
+        while (labellings := engine.labellings(self._cost)) is not None:
+            failed, refused = 0, None
+            for settled in labellings:
+                found = settled.any_map()
+                while found is not None:
+                    replayed = self._replay(found)
+                    if replayed.outcome is not Outcome.PREDICTED:
+                        failed = len(replayed.labels)
+                        break
+                    if refused := self._judging.why_refused(replace(found, labels=replayed.labels)):
+                        break
+                    self._sharing.absorb(replace(found, labels=replayed.labels))
+                    found = self._differing_map(settled, replayed.labels)
+                if failed or refused:
+                    break
+            if refused:
+                of_prefix = all(max(equality.first, equality.second) < engine.size for equality in refused)
+                if refused in forbidden or not of_prefix or not engine.forbid(refused):
+                    return False
+                forbidden.add(refused)
+            elif failed:
+                engine.grow(engine.next_size(failed))
+            else:
+                return True
+        return False
+
+    def _differing_map(self, settled: Settled, labels: Sequence[int]) -> SSHMap | None:
+        """A map of these labels in which some doubt about places or paths holds."""
+        return settled.map_with(
+            [(sort, labels[i], labels[j], one) for sort, i, j, one in self._doubts_of_classes(len(labels)) if sort != "dstates"]
+        )
+
+    def settle_steps(self) -> None:
+        """Take in maps until nothing is in doubt, where the readable encodings are asked."""
+        # No cut of a minimal map has more paths than it.
+        counts = dict(zip(self._task.theory.priorities, self._cost, strict=True))
+        names = counts["paths"] if "paths" in counts else paths_needed(self._task, len(self._task.trace), self._cost)
+        engine = StepEngine(self._task, names)
+        size = self._first_size()
+        while size:
+            size = self._settle_prefix(engine, size)
+
+    def _first_size(self) -> int:
+        """The shortest prefix that could settle all: the classes of what is known replay from there to the end."""
+        classes, actions = self._sharing.classes, self._task.log.actions
+        if not self._task.speedups.prefixes:
+            return len(classes)
+        links = set[tuple[int, int]]()
+        size = 1
+        for t, action in enumerate(actions):
+            if (classes[t], action) not in links:
+                links.add((classes[t], action))
+                size = t + 2
+        return size
+
+    def _settle_prefix(self, engine: StepEngine, size: int) -> int:
+        """Settle what is in doubt about a prefix. Returns the size to go on with; 0 where nothing is in doubt any more."""
+        engine.grow(size)
+        while (found := engine.map_with(list(self._doubts(size)), self._cost)) is not None:
+            replayed = self._replay(found)
+            whole = replace(found, labels=replayed.labels)
+            if equalities := self._judging.why_refused(found) or self._judging.why_refused(whole):
+                last = max(max(equality.first, equality.second) for equality in equalities)
+                if last >= size:
+                    return engine.next_size(last)
+                engine.forbid(equalities)
+            elif replayed.outcome is not Outcome.PREDICTED:
+                return engine.next_size(len(replayed.labels))
+            else:
+                self._sharing.absorb(whole)
+        replayed = self._task.log.replay(self._sharing.classes[:size])
+        return 0 if replayed.outcome is Outcome.PREDICTED else engine.next_size(len(replayed.labels))
+
+    def _replay(self, found: SSHMap) -> Replay:
+        """The trace replayed over a map of a prefix."""
+        return self._task.log.replay(found.labels, None, [s.place for s in found.dstates] if self._task.log.pairs else None)
+
+    def _doubts(self, size: int) -> Iterator[Doubt]:
+        """What is in doubt about a prefix: that steps are one after all, or are not."""
+        firsts = self._sharing.firsts()
+        yield from (("dstates", firsts[self._sharing.classes[t]], t, False) for t in self._entering(size))
+        yield from self._doubts_of_classes(size)
+
+    def _doubts_of_classes(self, size: int) -> Iterator[Doubt]:
+        """The same of classes, each of which the first step of it stands for."""
+        sharing = self._sharing
+        firsts = [t for t in sharing.firsts() if t < size]
+        for sort in sharing.sorts():
+            known = sharing.kept(sort)
+            heads: dict[int, int] = {}  # the first class of each number
+            for c in range(len(firsts)):
+                head = heads.setdefault(known.always[c], c)
+                if head != c:
+                    yield sort, firsts[head], firsts[c], False
+                if sort == "paths" and ((c, c) in known.together) != (c in known.unnamed):  # whether it is along a path
+                    yield sort, firsts[c], firsts[c], c in known.unnamed
+            for c, d in combinations(heads.values(), 2):
+                if (c, d) not in known.together and (sort != "dstates" or self._may_be_one(firsts[c], firsts[d])):
+                    yield sort, firsts[c], firsts[d], True
+
+    def _may_be_one(self, i: int, j: int) -> bool:
+        """Whether the views of two steps let them be one dstate."""
+        steps = self._task.trace.steps
+        return steps[i].view == steps[j].view or "functional_view" not in self._task.theory.hard
+
+    def _entering(self, size: int) -> Iterator[int]:
+        """Steps of the prefix that are not the first of their class, and that no earlier step shows to be there, as the same action led there from the same class."""
+        classes, actions = self._sharing.classes, self._task.log.actions
+        seen, links = {classes[0]}, set[tuple[int, int]]()
+        deterministic = "deterministic" in self._task.theory.hard
+        for t in range(1, size):
+            link = classes[t - 1], actions[t - 1]
+            if classes[t] in seen and not (deterministic and link in links):
+                yield t
+            seen.add(classes[t])
+            links.add(link)

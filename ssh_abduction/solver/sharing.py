@@ -1,0 +1,272 @@
+"""What maps of one trace share: which steps are one dstate, at one place, along one path and course, in all, in some, or in none of them.
+
+>>> from ssh_abduction.maps import DState, SSHMap
+>>> a, b = DState(0, "hall"), DState(1, "hall")
+>>> shared = Sharing()
+>>> shared.absorb(SSHMap((0, 0, 1), (a, b), ()))
+>>> shared.absorb(SSHMap((0, 1, 1), (a, b), ()))
+>>> shared.backbone(proven=True).dstates
+Shared(always=(0, 1, 2), sometimes=((0, 1), (1, 2)))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, Literal, TypeAlias
+
+from ssh_abduction.engines.doubts import Sort
+from ssh_abduction.maps import DState, SSHMap
+
+Pair: TypeAlias = tuple[int, int]
+
+SORTS: tuple[Sort, ...] = ("dstates", "places", "paths", "courses")
+# So many pairs of steps are printed, at most: more say little that the numbers of `always` do not.
+PRINTED = 1000
+# So many stretches of steps a sentence names, at most.
+NAMED = 6
+# So many ways in which dstates have places, paths or courses are remembered, so that none is compared twice.
+REMEMBERED = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """Which steps maps take for one: one dstate, at one place, along one path, or along one course (a path in one direction).
+
+    always     a number for each step. Steps of one number are one in all maps; the numbers are those of the first steps that have them, in order
+    sometimes  pairs of steps that are one in some maps and not in others. Each step stands for all of its number, and is the first of these
+
+    Steps of any other two numbers are one in no map. Where a dstate is along no path, its steps have a number that no others have; a pair of a step with
+    itself says that it is along some path in some maps, and along none in others.
+    """
+
+    always: tuple[int, ...]
+    sometimes: tuple[Pair, ...]
+
+    def one_in(self, i: int, j: int) -> Literal["all", "some", "none"]:
+        """Whether two steps are one in all maps, in some, or in none."""
+        if self.always[i] == self.always[j]:
+            return "all"
+        pair = tuple(sorted((self.always.index(self.always[i]), self.always.index(self.always[j]))))
+        return "some" if pair in self.sometimes else "none"
+
+    @property
+    def differing(self) -> tuple[int, ...]:
+        """The steps in which the maps differ: those which are one with an earlier step in some maps and not in others, and all that go with these."""
+        numbers = {self.always[later] for _, later in self.sometimes}
+        return tuple(t for t, number in enumerate(self.always) if number in numbers)
+
+    def to_dict(self, steps: Iterable[int]) -> dict[str, Any]:
+        """The numbers of these steps, and the pairs: if there are more than PRINTED, as many of them, and their count."""
+        more = {"pairs": len(self.sometimes)} if len(self.sometimes) > PRINTED else {}
+        return {"always": [self.always[t] for t in steps], "sometimes": [list(pair) for pair in self.sometimes[:PRINTED]], **more}
+
+
+@dataclass(frozen=True, slots=True)
+class Backbone:
+    """What all minimal maps of a trace share.
+
+    dstates, places, paths, courses  which steps are one, in all maps or in some. Of theories without places only dstates
+    proven                           whether this holds of all minimal maps. Else it is what those found share: pairs of steps that are one in some of these
+                                     are so in some minimal maps, but other minimal maps may differ in more
+    """
+
+    dstates: Shared
+    places: Shared | None
+    paths: Shared | None
+    courses: Shared | None
+    proven: bool
+
+    @property
+    def sorts(self) -> dict[Sort, Shared]:
+        """What there is of dstates, places, paths and courses."""
+        return {sort: shared for sort in SORTS if (shared := getattr(self, sort)) is not None}
+
+    @property
+    def sentence(self) -> str:
+        """What the maps share, and in which steps they differ."""
+        differing = {sort: shared for sort, shared in self.sorts.items() if shared.sometimes}
+        if "paths" in differing:  # a step along another path is along another course
+            differing.pop("courses", None)
+        same = [sort for sort in self.sorts if sort not in differing and sort != "courses"]
+        told = [f"the same {_listed(same)}"] if same else []
+        return "; ".join(told + [_told_differing(sort, shared) for sort, shared in differing.items()])
+
+    def to_dict(self) -> dict[str, Any]:
+        """As `solve --json` prints it (docs/formats.md): the dstates by step, and the rest by dstate, so that it is short for a long trace."""
+        labels = self.dstates.always
+        firsts = {number: t for t, number in reversed(list(enumerate(labels)))}
+        by_dstate = [firsts[number] for number in sorted(firsts)]
+        told: dict[str, Any] = {
+            sort: shared.to_dict(range(len(labels)) if sort == "dstates" else by_dstate) for sort, shared in self.sorts.items()
+        }
+        return {"proven": self.proven, **told}
+
+
+class Sharing:
+    """Takes in maps of one trace, one by one, and keeps what they share. The memory that it takes does not grow with their number.
+
+    Steps that are one dstate in all maps so far are a *class*. They are at one place, and along one course, in all of them, too: so these are compared by class.
+
+    maps     how many maps were taken in
+    classes  the class of each step
+    """
+
+    def __init__(self) -> None:
+        self.maps = 0
+        self.classes: tuple[int, ...] = ()
+        self._labels: tuple[int, ...] = ()  # of the last map
+        self._label_of: list[int] = []  # of each class, in the last map
+        self._kept: dict[Sort, Kept] = {}
+
+    def absorb(self, ssh_map: SSHMap) -> None:
+        """Take in a map."""
+        self.maps += 1
+        if ssh_map.labels != self._labels:
+            self._split_by(ssh_map.labels)
+        for sort, kept in self._sorts(ssh_map.dstates).items():
+            names = tuple(_name(ssh_map.dstates[label], sort) for label in self._label_of)
+            kept.absorb(names)
+
+    def _sorts(self, dstates: Sequence[DState]) -> Mapping[Sort, Kept]:
+        if not self._kept:
+            sorts = SORTS if any(s.place is not None for s in dstates) else SORTS[:1]
+            self._kept = {sort: Kept(len(self._label_of)) for sort in sorts}
+        return self._kept
+
+    def _split_by(self, labels: tuple[int, ...]) -> None:
+        """Split classes, so that the steps of each are at one dstate in this map, too."""
+        both = list(zip(self.classes or [0] * len(labels), labels, strict=True))
+        number = {pair: i for i, pair in enumerate(dict.fromkeys(both))}
+        self.classes = tuple(map(number.__getitem__, both))
+        self._labels, self._label_of = labels, [label for _, label in number]
+        for kept in self._kept.values():
+            kept.split([before for before, _ in number])
+
+    def firsts(self) -> list[int]:
+        """The first step of each class."""
+        first: dict[int, int] = {}
+        for t, number in enumerate(self.classes):
+            first.setdefault(number, t)
+        return list(first.values())
+
+    def sorts(self) -> Iterable[Sort]:
+        """What is compared."""
+        return self._kept
+
+    def kept(self, sort: Sort) -> Kept:
+        """What is known of one sort."""
+        return self._kept[sort]
+
+    def backbone(self, *, proven: bool) -> Backbone:
+        """What the maps so far share."""
+        found = {sort: self._shared(kept) for sort, kept in self._kept.items()}
+        return Backbone(found["dstates"], found.get("places"), found.get("paths"), found.get("courses"), proven)
+
+    def _shared(self, kept: Kept) -> Shared:
+        number: dict[int, int] = {}
+        always = tuple(number.setdefault(kept.always[c], len(number)) for c in self.classes)
+        first: dict[int, int] = {}
+        for t, n in enumerate(always):
+            first.setdefault(n, t)
+        pairs = {
+            (first[number[kept.always[i]]], first[number[kept.always[j]]])
+            for i, j in kept.together
+            if kept.always[i] != kept.always[j] or (i == j and i in kept.unnamed)
+        }
+        return Shared(always, tuple(sorted({(min(pair), max(pair)) for pair in pairs})))
+
+
+class Kept:
+    """Which classes are one in all maps, and which in some.
+
+    always    a number for each class: those of one number are one in all maps
+    together  pairs of classes that are one in some map, the smaller one first; each class with itself, unless it has no name in any
+    unnamed   classes that have no name in some map
+    """
+
+    def __init__(self, classes: int) -> None:
+        self.always: list[int] = [0] * classes
+        self.together: set[Pair] = set()
+        self.unnamed: set[int] = set()
+        self._seen: set[tuple[Hashable, ...]] = set()
+
+    def split(self, before: Sequence[int]) -> None:
+        """There are other classes now, each a part of one before."""
+        parts: dict[int, list[int]] = {}
+        for new, old in enumerate(before):
+            parts.setdefault(old, []).append(new)
+        self.always = [self.always[old] for old in before]
+        self.together = set(_split(self.together, parts))
+        self.unnamed = {part for old in self.unnamed for part in parts[old]}
+        self._seen.clear()
+
+    def absorb(self, names: tuple[Hashable, ...]) -> None:
+        """Take in what the classes are named in a map; those of one name are one, and None is no name."""
+        if names in self._seen:
+            return
+        if len(self._seen) == REMEMBERED:
+            self._seen.clear()
+        self._seen.add(names)
+        both = [(number, ("none", i) if name is None else name) for i, (number, name) in enumerate(zip(self.always, names, strict=True))]
+        numbers = {pair: i for i, pair in enumerate(dict.fromkeys(both))}
+        self.always = list(map(numbers.__getitem__, both))
+        members: dict[Hashable, list[int]] = {}
+        for i, name in enumerate(names):
+            if name is None:
+                self.unnamed.add(i)
+            else:
+                members.setdefault(name, []).append(i)
+        for some in members.values():
+            self.together.update((i, i) for i in some)
+            self.together.update(combinations(some, 2))
+
+
+def _split(together: Iterable[Pair], parts: Mapping[int, Sequence[int]]) -> Iterator[Pair]:
+    for i, j in together:
+        for a in parts[i]:
+            for b in parts[j]:
+                yield (a, b) if a <= b else (b, a)
+
+
+def _name(dstate: DState, sort: Sort) -> Hashable:
+    if sort == "dstates":
+        return dstate.id
+    if sort == "places":
+        return dstate.place
+    if sort == "paths":
+        return dstate.path
+    return None if dstate.path is None else (dstate.path, dstate.direction)
+
+
+def _told_differing(sort: Sort, shared: Shared) -> str:
+    if len(shared.differing) == len(shared.sometimes) == 1:
+        one = {"dstates": "one dstate", "places": "at one place", "paths": "along one path", "courses": "along one path in one direction"}[
+            sort
+        ]
+        first, later = shared.sometimes[0]
+        return f"steps {first} and {later} are {one} in some of them"
+    whose = {"dstates": "dstate", "places": "place", "paths": "path", "courses": "direction along the path"}[sort]
+    if len(shared.differing) == 1:
+        return f"the {whose} of step {shared.differing[0]} differs"
+    whose = {"courses": "directions along paths"}.get(sort, f"{whose}s")
+    return f"the {whose} of steps {stretches(shared.differing)} differ"
+
+
+def stretches(steps: Sequence[int]) -> str:
+    """12–15 and 40: at most NAMED stretches of steps, and how many steps more."""
+    runs: list[list[int]] = []
+    for step in steps:
+        if runs and step == runs[-1][-1] + 1:
+            runs[-1].append(step)
+        else:
+            runs.append([step])
+    told = [f"{s[0]}–{s[-1]}" if len(s) > 1 else str(s[0]) for s in runs[:NAMED]]
+    more = sum(map(len, runs[NAMED:]))
+    return _listed([*told, f"{more} more"] if more else told)
+
+
+def _listed(words: Sequence[str]) -> str:
+    """a, b and c."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -1,0 +1,222 @@
+"""Stars: which gateways a robot sees at a place, and in which direction each of them is.
+
+>>> from ssh_abduction.star import Star
+>>> [gateway.bearing for gateway in Star.of((1, 0, 1, 0)).gateways]
+[0.0, 180.0]
+>>> Star.of((0, 120, 240)).openings is None
+True
+>>> [frame.bearings for frame in Star.of((1, None, 1, 0)).frames]
+[(0, 180), (0, 90, 180)]
+
+A gateway is known by its bearing, in degrees clockwise from straight ahead. Two sightings of one gateway agree if their bearings, once one of them is turned, differ by at most the
+sum of their spreads. So nothing here asks for right angles. Where all gateways are near quarters, a star is also four openings, which is what the fast engines read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, TypeAlias
+
+from ssh_abduction.errors import TraceError, brief, is_finite, is_whole
+
+Openings: TypeAlias = tuple[bool, bool, bool, bool]
+Entry: TypeAlias = "float | Gateway | None"
+
+SPREAD = 10.0  # Degrees that a bearing may be off, where a trace does not say. So junctions of 90 and of 120 degrees are told apart, as these differ by more than twice that.
+QUARTER = 20.0  # Degrees that a bearing may be off a quarter (ahead, right, back, left) and still be taken for it.
+WIDEST = 90.0  # A gateway that was not observed may be anywhere in a half circle, at most.
+MOST_UNKNOWN = 6  # Gateways of one star that were not observed: each may be there or not, so more of them would leave too many ways.
+_FIELDS = ("bearing", "spread", "opposite", "open")
+
+
+@dataclass(frozen=True, slots=True)
+class Gateway:
+    """A way out of a place, as it is seen at one step.
+
+    bearing   degrees, clockwise from straight ahead
+    spread    degrees that the bearing may be off
+    opposite  the index, in the star, of the gateway that the same path leaves through; None where that is the one straight opposite, if there is one
+    open      True; None where it was not observed whether there is a gateway
+    """
+
+    bearing: float
+    spread: float = SPREAD
+    opposite: int | None = None
+    open: bool | None = True
+
+    def to_json(self) -> Any:
+        """The bearing alone, or an object where there is more to say."""
+        if self == Gateway(self.bearing):
+            return self.bearing
+        said = {"bearing": self.bearing, "spread": self.spread}
+        said |= {} if self.opposite is None else {"opposite": self.opposite}
+        return said if self.open else {**said, "open": None}
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The gateways of a place as they are seen at one step, none of them unknown. They are its slots, numbered clockwise from the one ahead, or the next after it.
+
+    bearings  whole degrees, clockwise from straight ahead
+    spreads   whole degrees
+    opposite  for each slot, the slot that the star declares to be the other side of the same path, or None
+    """
+
+    bearings: tuple[int, ...]
+    spreads: tuple[int, ...]
+    opposite: tuple[int | None, ...]
+
+    @property
+    def slots(self) -> int:
+        """How many gateways there are."""
+        return len(self.bearings)
+
+    def nth(self, turn: str | None, number: int) -> int | None:
+        """The slot of the gateway that is so many to the right or left of straight ahead, the one straight ahead not counted; None if there are fewer."""
+        beside = [k for k in range(self.slots) if not self.faces(k)]
+        order = beside if turn == "right" else beside[::-1]
+        return order[number - 1] if number <= len(order) else None
+
+    def faces(self, slot: int) -> bool:
+        """Whether the robot faces this gateway."""
+        return abs((self.bearings[slot] + 180) % 360 - 180) <= self.spreads[slot]
+
+    def has_behind(self, slot: int) -> bool:
+        """Whether this gateway is straight behind the robot."""
+        return abs(self.bearings[slot] % 360 - 180) <= self.spreads[slot]
+
+
+@dataclass(frozen=True, slots=True)
+class Star:
+    """All gateways that are seen at a step."""
+
+    gateways: tuple[Gateway, ...]
+
+    @classmethod
+    def of(cls, entries: Sequence[Entry]) -> Star:
+        """The star that a trace writes as four 0/1/null (ahead, right, back, left), or as bearings and gateways."""
+        if is_four(entries):
+            quarters = ((90.0 * k, entry) for k, entry in enumerate(entries))
+            return cls(tuple(Gateway(bearing, open=True if entry else None) for bearing, entry in quarters if entry != 0))
+        return cls(tuple(entry if isinstance(entry, Gateway) else Gateway(float(entry or 0)) for entry in entries))
+
+    @property
+    def openings(self) -> Openings | None:
+        """Whether there is a gateway (ahead, right, back, left). None where some gateway was not observed, is in none of these directions, or has another
+        opposite than the one straight opposite, or where two are in one direction.
+        """
+        found: dict[int, int] = {}
+        for k, gateway in enumerate(self.gateways):
+            slot = near_quarter(gateway.bearing)
+            if slot is None or not gateway.open or found.setdefault(slot, k) != k:
+                return None
+        if any(g.opposite is not None and found.get((slot + 2) % 4) != g.opposite for slot, k in found.items() if (g := self.gateways[k])):
+            return None
+        return 0 in found, 1 in found, 2 in found, 3 in found
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """All that the place may look like from here: each gateway that was not observed is there, or is not."""
+        unknown = [k for k, gateway in enumerate(self.gateways) if not gateway.open]
+        left_out = (set(some) for count in range(len(unknown), -1, -1) for some in combinations(unknown, count))
+        return tuple(dict.fromkeys(self._frame([k for k in range(len(self.gateways)) if k not in some]) for some in left_out))
+
+    @property
+    def too_near(self) -> tuple[float, float] | None:
+        """The bearings of two gateways that could be one, by their spreads; None if there are no such."""
+        seen = [gateway for gateway in self.gateways if gateway.open]
+        for a, b in combinations(seen, 2):
+            if abs((a.bearing - b.bearing + 180) % 360 - 180) <= a.spread + b.spread:
+                return a.bearing, b.bearing
+        return None
+
+    def _frame(self, kept: list[int]) -> Frame:
+        """The frame of these gateways."""
+        clockwise = sorted(kept, key=lambda k: (self.gateways[k].bearing + self.gateways[k].spread) % 360)
+        slot = {k: i for i, k in enumerate(clockwise)}
+        gateways = [self.gateways[k] for k in clockwise]
+        return Frame(
+            tuple(round(g.bearing) % 360 for g in gateways),
+            tuple(round(g.spread) for g in gateways),
+            tuple(None if g.opposite is None else slot.get(g.opposite) for g in gateways),
+        )
+
+
+def is_four(entries: Sequence[Entry]) -> bool:
+    """Whether a star is written as four 0/1/null, which are openings and not bearings: as bearings at least two of them would be equal."""
+    return len(entries) == 4 and all(x is None or (not isinstance(x, Gateway) and x in (0, 1)) for x in entries)
+
+
+def near_quarter(bearing: float) -> int | None:
+    """The quarter (0 ahead, 1 right, 2 back, 3 left) that a bearing is near, or None."""
+    quarter = round(bearing / 90)
+    return quarter % 4 if abs(bearing - 90 * quarter) <= QUARTER else None
+
+
+def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
+    """The star that a trace gives, its numbers and objects checked. Raises TraceError that says where."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()  # numpy's
+    if not isinstance(value, list | tuple):
+        raise TraceError(f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]")
+    given = [int(x) if isinstance(x, bool) else x for x in value]
+    four = len(given) == 4 and all(x is None or x in (0, 1) for x in given if not isinstance(x, Mapping | Gateway))
+    star = tuple(_entry(x, len(given), four, f"{where}[{i}]") for i, x in enumerate(given))
+    if not is_four(star) and len({(e.bearing if isinstance(e, Gateway) else float(e or 0)) % 360 for e in star if _is_seen(e)}) < sum(
+        map(_is_seen, star)
+    ):
+        raise TraceError(
+            f"{where}: expected four 0/1 (openings ahead, right, back, left) or different bearings in degrees, got {brief(list(value))}; mend it"
+        )
+    for i, entry in enumerate(star):
+        _check_opposite(i, entry, star, f"{where}[{i}]")
+    if sum(not _is_seen(entry) for entry in star) > MOST_UNKNOWN:
+        raise TraceError(f"{where}: expected at most {MOST_UNKNOWN} gateways that were not observed, got more; leave some out")
+    return star
+
+
+def _is_seen(entry: Entry) -> bool:
+    return bool(entry.open) if isinstance(entry, Gateway) else entry is not None
+
+
+def _entry(value: Any, count: int, four: bool, where: str) -> Entry:
+    if isinstance(value, Gateway):
+        value = {"bearing": value.bearing, "spread": value.spread, "opposite": value.opposite, "open": value.open}
+    if isinstance(value, Mapping):
+        return _gateway(value, count, where)
+    if value is None and four:
+        return None
+    if not is_finite(value):
+        raise TraceError(f"{where}: expected a finite number, got {brief(value)}; replace it, or leave the field out")
+    return value if type(value) in (int, float) else int(value) if is_whole(value) else float(value)  # numpy's numbers are no JSON
+
+
+def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
+    if unknown := [name for name in value if name not in _FIELDS]:
+        raise TraceError(f"{where}: expected fields out of {', '.join(_FIELDS)}, got {brief(unknown[0])}; leave it out")
+    bearing, spread, opposite, is_open = (
+        value.get(name, default) for name, default in zip(_FIELDS, (None, SPREAD, None, True), strict=True)
+    )
+    if not is_finite(bearing):
+        raise TraceError(f"{where}.bearing: expected a number of degrees, got {brief(bearing)}; say in which direction the gateway is")
+    if is_open is not None and is_open is not True:
+        raise TraceError(f"{where}.open: expected true, or null where it was not observed, got {brief(is_open)}; leave out what is closed")
+    widest = WIDEST if is_open is None else WIDEST / 2
+    if not is_finite(spread) or not 0 <= spread <= widest:
+        raise TraceError(f"{where}.spread: expected 0 to {widest:g} degrees, got {brief(spread)}; say how far the bearing may be off")
+    if opposite is not None and not (is_whole(opposite) and 0 <= opposite < count):
+        raise TraceError(f"{where}.opposite: expected the index of a gateway, 0 to {count - 1}, got {brief(opposite)}; count from 0")
+    return Gateway(float(bearing), float(spread), None if opposite is None else int(opposite), is_open)
+
+
+def _check_opposite(i: int, entry: Entry, star: Sequence[Entry], where: str) -> None:
+    if not isinstance(entry, Gateway) or entry.opposite is None:
+        return
+    other = star[entry.opposite]
+    back = other.opposite if isinstance(other, Gateway) else None
+    if entry.opposite == i or back not in (None, i):
+        raise TraceError(
+            f"{where}.opposite: expected another gateway, whose opposite is this one, got {entry.opposite}; pair each gateway with one other"
+        )

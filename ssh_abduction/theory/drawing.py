@@ -1,0 +1,174 @@
+"""Whether edges between places can be drawn in the plane without a crossing, where it is known in part how they lie around a place.
+
+>>> three_edges = [("a", "b"), ("a", "b"), ("a", "b")]
+>>> can_be_drawn(three_edges, lambda place, ends: True)
+True
+>>> is_planar({"a": (0, 2, 4), "b": (5, 3, 1)}), is_planar({"a": (0, 2, 4), "b": (1, 3, 5)})
+(True, False)
+
+Edge number e has two ends, 2e and 2e + 1. The ends around each place, clockwise, make a *rotation system*. Its faces are traced by going along an edge and
+leaving by the next end around the place. It is the one of a drawing in the plane without crossings exactly if V - E + F = 2 for each
+connected part (Euler; Edmonds 1960; Mohar & Thomassen, Graphs on Surfaces, 2001, chapter 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import TypeAlias, TypeVar
+
+Ends: TypeAlias = tuple[int, ...]
+Place = TypeVar("Place", bound=Hashable)
+State = TypeVar("State")
+Step = TypeVar("Step")
+
+
+def is_planar(around: Mapping[Place, Ends]) -> bool:
+    """Whether a rotation system is one of the plane.
+
+    around  for each place, the ends of edges around it, clockwise, from any end on; each edge has both ends in it
+    """
+    places = [place for place, ends in around.items() if ends]
+    edges = sum(len(around[place]) for place in places) // 2
+    return len(places) - edges + _faces(around) == 2 * _parts(around)
+
+
+def _faces(around: Mapping[Place, Ends]) -> int:
+    """How many faces a rotation system has, not counting those around places without edges."""
+    following = {end: ends[i - len(ends) + 1] for ends in around.values() for i, end in enumerate(ends)}
+    faces = 0
+    left = set(following)
+    while left:
+        faces += 1
+        end = start = left.pop()
+        while (end := following[end ^ 1]) != start:
+            left.remove(end)
+    return faces
+
+
+def _parts(around: Mapping[Place, Ends]) -> int:
+    """How many connected parts there are, not counting places without edges."""
+    place_of = {end: place for place, ends in around.items() for end in ends}
+    parts = 0
+    left = set(place_of.values())
+    while left:
+        parts += 1
+        queue = [left.pop()]
+        while queue:
+            new = {place_of[end ^ 1] for end in around[queue.pop()]} & left
+            left -= new
+            queue.extend(new)
+    return parts
+
+
+def can_be_drawn(edges: Sequence[tuple[Place, Place]], allows: Callable[[Place, Ends], bool]) -> bool:
+    """Whether there is an order of the ends around each place in which the edges do not cross.
+
+    edges   the two places that each one joins
+    allows  whether some ends may lie around a place in this order, clockwise, from any of them on. What it allows of some ends it allows of fewer of them, and it
+            allows some order of all ends that has an allowed order of some in it.
+    """
+    place_of = [place for edge in edges for place in edge]
+    if not all(allows(place, ()) for place in set(place_of)):
+        return False
+    ends_at: dict[Place, list[int]] = {}
+    for end in sorted(end for edge in _on_rings(place_of) for end in (2 * edge, 2 * edge + 1)):
+        ends_at.setdefault(place_of[end], []).append(end)
+    orders = {place: _orders(ends, partial(allows, place)) for place, ends in ends_at.items()}
+    nothing: dict[Place, Ends] = {}
+    return has_way(nothing, range(len(orders)), lambda drawn, _: _one_place_more(drawn, orders, place_of))
+
+
+def _on_rings(place_of: Sequence[Place]) -> set[int]:
+    """The edges that are left when dead ends are taken away one after another: a dead end can be drawn wherever its edge has to begin."""
+    ends_at: dict[Place, set[int]] = {}
+    for end, place in enumerate(place_of):
+        ends_at.setdefault(place, set()).add(end)
+    queue = list(ends_at)
+    while queue:
+        if len(ends := ends_at[queue.pop()]) == 1:
+            end = ends.pop()
+            other = place_of[end ^ 1]
+            ends_at[other].remove(end ^ 1)
+            queue.append(other)
+    return {end // 2 for ends in ends_at.values() for end in ends}
+
+
+def _orders(ends: Sequence[int], allows: Callable[[Ends], bool]) -> list[Ends]:
+    """The clockwise orders of some ends that are allowed, the first one first."""
+    orders: list[Ends] = [()]
+    for end in ends:
+        longer = ((*order[:gap], end, *order[gap:]) for order in orders for gap in range(min(1, len(order)), len(order) + 1))
+        orders = [order for order in longer if allows(order)]
+    return orders
+
+
+def _one_place_more(
+    drawn: dict[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
+) -> Iterator[dict[Place, Ends]]:
+    """The ways to draw one more place, one that is joined to those drawn if there is any: that with the fewest ways, so that what is certain comes first."""
+    near = {place_of[end ^ 1]: None for ends in drawn.values() for end in ends if place_of[end ^ 1] not in drawn}
+    among = near or {place: None for place in orders if place not in drawn}
+    fewest: list[dict[Place, Ends]] | None = None
+    for place in sorted(among, key=lambda place: len(orders[place])):
+        ways = [more for order in orders[place] if _leaves_room(more := {**drawn, place: order}, orders, place_of)]
+        if fewest is None or len(ways) < len(fewest):
+            fewest = ways
+        if len(fewest) <= 1 or not near:
+            break
+    return iter(fewest or ())
+
+
+def _leaves_room(drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]) -> bool:
+    """Whether places are drawn so that each connected part of the others can lie in one face.
+
+    Such a part is drawn as one place, with the ends that lead to it in the order in which that face meets them.
+    """
+    part = _parts_of_rest(drawn, orders, place_of)
+    following = {end: ends[i - len(ends) + 1] for ends in drawn.values() for i, end in enumerate(ends)}
+    met: dict[Place, list[int]] = {}  # for each part, the ends in it, as one face meets them
+    left = set(following)
+    while left:
+        here = start = left.pop()
+        there: dict[Place, list[int]] = {}
+        while True:
+            other = here ^ 1
+            if other not in following:
+                there.setdefault(part[place_of[other]], []).append(other)
+                here = following[here]
+            else:
+                here = following[other]
+            if here == start:
+                break
+            left.remove(here)
+        for number, ends in there.items():
+            if number in met:
+                return False
+            met[number] = ends
+    return is_planar({**drawn, **{("rest", number): tuple(reversed(ends)) for number, ends in met.items()}})
+
+
+def _parts_of_rest(drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]) -> dict[Place, Place]:
+    """For each place that is not drawn, one that stands for the connected part that it is in."""
+    part: dict[Place, Place] = {}
+    for first in orders:
+        queue = [] if first in drawn or first in part else [first]
+        while queue:
+            place = queue.pop()
+            part[place] = first
+            queue += [q for end in orders[place][0] if (q := place_of[end ^ 1]) not in drawn and q not in part] if orders[place] else []
+    return part
+
+
+def has_way(start: State, steps: Sequence[Step], ways: Callable[[State, Step], Iterator[State]]) -> bool:
+    """Whether all steps can be gone from a start, each in one of its ways. It is a depth-first search, without recursion as there may be many steps."""
+    gone: list[Iterator[State]] = []
+    state = start
+    while len(gone) < len(steps):
+        gone.append(ways(state, steps[len(gone)]))
+        while (following := next(gone[-1], None)) is None:
+            gone.pop()
+            if not gone:
+                return False
+        state = following
+    return True

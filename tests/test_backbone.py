@@ -1,0 +1,268 @@
+"""What all minimal maps share: as the list of all maps says, and without it."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import random
+from collections.abc import Callable
+from itertools import combinations_with_replacement
+from unittest.mock import patch
+
+import pytest
+from brute_force import Key, minimal_maps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import TOYS, theories, traces
+from worlds import HEADINGS, QUARTERS, TWO_BLOCKS, Streets, drive, rectangle
+
+from benchmarks.instances import maze
+from ssh_abduction import OnlineMapper, Search, Status, Theory, Trace, solve
+from ssh_abduction.asp.limits import Watch
+from ssh_abduction.cli import main
+from ssh_abduction.engines.framed import FramedEngine
+from ssh_abduction.engines.frameless import FramelessEngine
+from ssh_abduction.engines.stepwise import StepEngine
+from ssh_abduction.solver import prefixes
+from ssh_abduction.solver import search as solver
+from ssh_abduction.solver.result import summary_of
+from ssh_abduction.solver.sharing import Backbone, Shared
+
+ACES3 = "examples/aces3-route.jsonl"
+LIMIT = 10  # seconds: a search that does not end is a failure, not a hang
+
+
+def expected_pairs(keys: set[Key], one: Callable[[Key, int, int], bool], steps: int) -> dict[tuple[int, int], str]:
+    """For each pair of steps, whether they are one in all, some, or none of the maps."""
+    said = {1: "all", 0: "none"}
+    shares = {(i, j): sum(one(key, i, j) for key in keys) / len(keys) for i, j in combinations_with_replacement(range(steps), 2)}
+    return {pair: said.get(share, "some") for pair, share in shares.items()}
+
+
+def one_dstate(key: Key, i: int, j: int) -> bool:
+    return key[0][i] == key[0][j]
+
+
+def at_one_place(key: Key, i: int, j: int) -> bool:
+    return key[1][key[0][i]] == key[1][key[0][j]]
+
+
+def along_one_path(key: Key, i: int, j: int) -> bool:
+    here, there = key[2][key[0][i]], key[2][key[0][j]]
+    return here is not None and there is not None and here[0] == there[0]
+
+
+def along_one_course(key: Key, i: int, j: int) -> bool:
+    here, there = key[2][key[0][i]], key[2][key[0][j]]
+    return here is not None and here == there
+
+
+SORTS = {"dstates": one_dstate, "places": at_one_place, "paths": along_one_path, "courses": along_one_course}
+
+
+def agrees(backbone: Backbone, keys: set[Key], steps: int) -> None:
+    """The backbone says of each pair of steps what the maps of the brute force say."""
+    for sort, shared in backbone.sorts.items():
+        for (i, j), said in expected_pairs(keys, SORTS[sort], steps).items():
+            if i != j and (sort == "dstates" or backbone.dstates.one_in(i, j) != "all"):
+                assert shared.one_in(i, j) == said, (sort, i, j)
+            elif sort == "paths":  # a step with itself: whether it is along a path
+                first = shared.always.index(shared.always[i])
+                assert ((first, first) in shared.sometimes) == (said == "some"), i
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(st.data())
+def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
+    """From the list where it is complete, and by reasoning from one map where it was cut off: from prefixes that are too short to begin with."""
+    trace = data.draw(traces(max_steps=6), label="trace")
+    theory = data.draw(theories(trace), label="theory")
+    toys = [toy for toy in TOYS if toy.rules in theory.rules]
+    counts, keys = minimal_maps(trace, theory, lambda key: all(toy.allows(key) for toy in toys))
+    first_prefix = data.draw(st.sampled_from([1, prefixes.FIRST_PREFIX]), label="first prefix")
+    # Engines that settle dstates first are for longer traces, and those for places without frames only where clingo takes its time.
+    few_steps = data.draw(st.sampled_from([0, solver.FEW_STEPS]), label="few steps")
+    frame_after = data.draw(st.sampled_from([0.0, solver.FRAME_AFTER]), label="frame after")
+    patches = {"FEW_STEPS": few_steps, "FRAME_AFTER": frame_after, "ONE_MORE": 0.0, "ONE_MORE_SHARE": 0.0}
+    with patch.object(prefixes, "FIRST_PREFIX", first_prefix), patch.multiple(solver, **patches):
+        every = solve(trace, theory, maps=0, limit=LIMIT)
+        first = solve(trace, theory, maps=1, limit=LIMIT)
+        assert counts is None or first.backbone is not None
+    if counts is None:
+        assert every.backbone is first.backbone is None
+        assert every.summary == "no map satisfies the axioms"
+        return
+    for solution in (every, first):
+        assert solution.backbone is not None
+        assert solution.backbone.proven
+        agrees(solution.backbone, keys, len(trace))
+    assert every.summary.startswith(f"{len(keys)} minimal map")
+
+
+@pytest.mark.parametrize(
+    ("theory", "count", "shared"),
+    [
+        (Theory(), 4, "the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ"),
+        (Theory(star="none", prefer=("dstates", "places", "paths")), 102, "the same dstates and paths; the places of steps 14–22 differ"),
+    ],
+)
+def test_reasoning_from_one_map_says_what_the_whole_list_says(theory: Theory, count: int, shared: str) -> None:
+    trace = Trace.load(ACES3)
+    every, first = solve(trace, theory, maps=0), solve(trace, theory, maps=1)
+    assert every.summary == f"{count} minimal maps: {shared}"
+    assert first.summary == f"at least 1 minimal map (listing was stopped by the maps limit): {shared}"
+    assert first.backbone == every.backbone
+    assert first.rivals is not None
+    assert first.rivals.sharing.maps < 20
+
+
+def walk(world: Streets, place: str, steps: int, seed: int) -> Trace:
+    """A random walk that begins facing east."""
+    chance, start, facing = random.Random(seed), place, HEADINGS.index("E")
+    actions = []
+    for _ in range(steps):
+        ahead = world[place].get(HEADINGS[facing])
+        actions.append(chance.choice(["R", "L", *(["T"] * 3 if ahead else [])]))
+        if actions[-1] == "T" and ahead:
+            place = ahead
+        else:
+            facing = (facing + QUARTERS[actions[-1]]) % 4
+    return drive(world, start, "E", actions)
+
+
+@pytest.mark.parametrize(("frame_after", "engine"), [(60.0, StepEngine), (0.0, FramelessEngine)])
+def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine: type) -> None:
+    """32 maps that differ in dstates, too: found by a prefix of the readable encodings, or by labels that are settled before places and paths."""
+    trace, theory = walk(TWO_BLOCKS, "a1", 60, 1), Theory(boundary="none", prefer=("dstates",))
+    with patch.object(solver, "FRAME_AFTER", frame_after):
+        every, first = solve(trace, theory, maps=0), solve(trace, theory, maps=1)
+    assert first.rivals is not None
+    assert type(first.rivals.engine) is engine
+    assert every.count == 32
+    assert first.backbone == every.backbone
+    assert first.backbone is not None
+    assert len(first.backbone.dstates.always) == len(trace)
+    assert first.backbone.dstates.differing
+    assert first.rivals.sharing.maps < 16
+    assert (first.prefix < len(trace)) == (engine is StepEngine)
+
+
+def test_a_maze_with_stars_is_reasoned_about_by_its_labels() -> None:
+    """Seven maps in three labellings."""
+    trace = maze(5, 5, steps=100, seed=1, stars=True).trace
+    every, first = solve(trace, maps=0), solve(trace, maps=1)
+    assert every.count == 7
+    assert first.rivals is not None
+    assert type(first.rivals.engine) is FramedEngine
+    assert first.backbone == every.backbone
+    assert "7 minimal maps: the dstates of steps 80, 83–84, 97 and 99–100 differ" in every.summary
+
+
+def test_what_is_listed_is_not_taken_for_proven_where_time_is_over() -> None:
+    trace = Trace.load(ACES3)
+    search = Search(trace, Theory(star="none"), maps=2, reasons=True)
+    found = []
+    for ssh_map in search:
+        found.append(ssh_map)
+        search.interrupt()
+    solution = search.solution(tuple(found))
+    assert solution.backbone is not None
+    assert not solution.backbone.proven
+    assert solution.summary.startswith("at least 1 minimal map (listing was interrupted): the same dstates, places and paths, as far as")
+
+
+def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end() -> None:
+    theory = Theory(boundary="none", path_order="partial", prefer=())
+    search = Search(rectangle(14), theory, maps=0, limit=30, reasons=True)
+    with patch.object(Watch, "reserve_begins", 0.3):
+        count = sum(1 for _ in search)
+    solution = search.solution()
+    assert solution.stopped == "time limit"
+    assert solution.seconds.total < 30
+    assert solution.backbone is not None
+    assert solution.backbone.proven
+    found = "the dstates of steps 4–14 differ; the places of steps 4–14 differ; the paths of steps 0 and 3–14 differ"
+    assert (
+        summary_of(solution, count, solution.backbone) == f"at least {count} minimal maps (listing was stopped by the time limit): {found}"
+    )
+
+
+def test_what_is_known_goes_to_other_processes_and_what_asks_clingo_does_not() -> None:
+    solution = solve(Trace.load(ACES3), maps=1)
+    same = pickle.loads(pickle.dumps(solution))
+    assert same == solution
+    assert same.backbone is not None
+    assert not same.backbone.proven
+    assert solution.backbone is not None
+    assert solution.backbone.proven
+
+
+def test_while_the_robot_drives_the_backbone_is_that_of_the_maps_listed() -> None:
+    mapper = OnlineMapper("end", limit=None)
+    for action, view in [("travel", "hall"), ("travel", "end"), ("around", "end"), ("travel", "hall")]:
+        mapper.observe(action, view)
+    assert mapper.solution.summary == "2 minimal maps: the same dstates and paths; the place of step 4 differs"
+
+
+@pytest.mark.parametrize(
+    ("theory", "maps", "within", "summary"),
+    [
+        (
+            Theory(),
+            0,
+            3,
+            "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ; and 7 with up to 3 more",
+        ),
+        (Theory(), 4, 3, "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ"),
+        (Theory.causal(), 0, 0, "1 minimal map"),
+        (Theory(same=[(0, 1)]), 0, 0, "no map satisfies the axioms"),
+    ],
+)
+def test_the_summary_is_a_sentence(theory: Theory, maps: int, within: int, summary: str) -> None:
+    assert solve(Trace.load(ACES3), theory, maps=maps, within=within).summary == summary
+
+
+def test_nothing_is_shared_where_no_map_is_proven_minimal() -> None:
+    solution = solve(Trace.load(ACES3), limit=1e-9)
+    assert solution.status is Status.FEASIBLE
+    assert solution.backbone is None
+    assert solution.summary == "a map that is not proven minimal"
+
+
+@pytest.fixture
+def solved(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What `solve` prints of the real route."""
+
+    def printed(*words: str) -> str:
+        assert main(["solve", ACES3, *words]) == 0
+        return capsys.readouterr().out
+
+    return printed
+
+
+def test_the_shell_tells_the_backbone_where_the_list_is_cut_off(solved: Callable[..., str]) -> None:
+    shared = "the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ"
+    cut = solved("-n", "2")
+    assert f"\nat least 2 minimal maps (listing was stopped by the maps limit): {shared}\n" in cut
+    assert "steps at one dstate in all minimal maps" in cut
+    assert "at one place in some of them: the steps 0 and 15, 6 and 15, 14 and 17" in cut
+    every = solved("-n", "0")
+    assert f"\n4 minimal maps: {shared}\n" in every
+    assert "steps at one dstate" not in every
+
+
+def test_the_json_has_the_summary_and_the_backbone(solved: Callable[..., str]) -> None:
+    cut, every = (json.loads(solved("-n", count, "--json")) for count in ("2", "0"))
+    assert cut["summary"].startswith("at least 2 minimal maps (")
+    assert every["summary"].startswith("4 minimal maps: ")
+    assert cut["backbone"] == every["backbone"]
+    assert cut["backbone"]["proven"]
+    assert cut["backbone"]["dstates"] == {"always": every["maps"][0]["labels"], "sometimes": []}
+    assert len(cut["backbone"]["places"]["always"]) == every["cost"]["dstates"]
+    assert [0, 15] in cut["backbone"]["places"]["sometimes"]
+
+
+def test_of_many_pairs_so_many_are_printed_and_all_are_counted() -> None:
+    pairs = tuple((0, t) for t in range(1, 1501))
+    told = Shared((*range(1501),), pairs).to_dict([0, 1])
+    assert (told["always"], len(told["sometimes"]), told["pairs"]) == ([0, 1], 1000, 1500)

@@ -1,0 +1,340 @@
+"""Stars of any number of gateways: as values, in tolerance, under the axioms of gateways.lp, and in worlds with streets at any angles."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import networkx as nx
+import planar
+import pytest
+from brute_force import key, minimal_maps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planar import drive
+
+from ssh_abduction import OnlineMapper, Status, Theory, Trace, TraceError, solve
+from ssh_abduction.judge import gateways as judge
+from ssh_abduction.judge.checker import check
+from ssh_abduction.solver import prefixes
+from ssh_abduction.star import Frame, Gateway, Star
+from ssh_abduction.steps import frames
+from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.trace import Action, Step
+
+GATEWAYS = Theory(star="gateways")
+
+
+# --- values and files
+
+
+def test_a_star_survives_a_round_trip(tmp_path: Path) -> None:
+    lines = [
+        '{"format": "ssh-trace", "version": 1}',
+        '{"view": "a", "action": {"name": "r2", "kind": "turn", "turn": "right", "gateway": 2}, "star": [1, null, 0, 1]}',
+        '{"view": "b", "action": {"name": "veer", "kind": "turn", "turn": "left", "bearing": -60}, '
+        '"star": [30, {"bearing": 120.0, "spread": 5.0, "opposite": 2}, {"bearing": 270.0, "spread": 10.0}]}',
+        '{"view": "c", "star": [0, {"bearing": 180.0, "spread": 90.0, "open": null}]}',
+    ]
+    (tmp_path / "t.jsonl").write_text("\n".join(lines) + "\n")
+    trace = Trace.load(tmp_path / "t.jsonl")
+    again = [json.loads(line) for line in trace.to_lines()]
+    expected = [json.loads(line) for line in lines]
+    expected[2]["star"][2] = 270.0  # an object that says no more than a bearing does
+    assert again == expected
+    assert trace.steps[2].star == (0, Gateway(180, 90, None, None))
+
+
+def test_what_is_in_quarters() -> None:
+    fits = [(1, 0, 1, 1), (0, 90), (-90, 170, 20), (), ({"bearing": 0, "opposite": 1}, {"bearing": 180})]
+    does_not = [(0, 120), (1, None, 0, 0), (0, 30), ({"bearing": 0, "opposite": 1}, {"bearing": 90}), ({"bearing": 0, "open": None},)]
+    for star in fits:
+        assert Trace.from_steps("a", [], stars=[star]).in_quarters
+    for star in does_not:
+        assert not Trace.from_steps("a", [], stars=[star]).in_quarters
+    for action in ({"name": "r", "kind": "turn", "bearing": 60}, {"name": "r", "kind": "turn", "turn": "right", "gateway": 1}):
+        assert not Trace.from_steps("aa", [action], stars=[(0, 90)] * 2).in_quarters
+    assert Trace.from_steps("aa", [{"name": "r", "kind": "turn", "bearing": 95}], stars=[(0, 90)] * 2).in_quarters
+
+
+def test_what_the_trace_tells_settles_the_star() -> None:
+    square, bend = (Trace.from_steps("a", [], stars=[star]) for star in ((0, 90), (0, 120)))
+    for star in ("auto", "frame"):
+        assert Theory(star=star).resolve(square).star == "frame"
+        assert Theory(star=star).resolve(bend).star == "gateways"
+    assert Theory(star="gateways").resolve(square).star == "gateways"
+    with pytest.raises(TraceError, match=r"step 0: star: expected bearings that fall into different quarters.*take star=gateways"):
+        Theory(star="pattern").resolve(bend)
+
+
+@pytest.mark.parametrize(
+    ("star", "message"),
+    [
+        ([0, None], r"star\[1\]: expected a finite number"),
+        ([{"bearing": "n"}], r"star\[0\]\.bearing: expected a number of degrees"),
+        ([{"bearing": 0, "width": 2}], r"star\[0\]: expected fields out of bearing, spread, opposite, open, got 'width'"),
+        ([{"bearing": 0, "spread": 50}], r"star\[0\]\.spread: expected 0 to 45 degrees"),
+        ([{"bearing": 0, "spread": -1}], r"star\[0\]\.spread: expected"),
+        ([{"bearing": 0, "open": False}], r"star\[0\]\.open: expected true, or null"),
+        ([{"bearing": 0, "opposite": 1}], r"star\[0\]\.opposite: expected the index of a gateway, 0 to 0"),
+        ([{"bearing": 0, "opposite": 0}], r"star\[0\]\.opposite: expected another gateway"),
+        ([{"bearing": 0, "opposite": 1}, {"bearing": 90, "opposite": 2}, 200], r"star\[0\]\.opposite: expected another gateway"),
+        ([{"bearing": 10 * k, "open": None} for k in range(7)], "star: expected at most 6 gateways that were not observed"),
+        ("1000", "star: expected a list"),
+    ],
+)
+def test_a_malformed_star_is_an_error(star: Any, message: str) -> None:
+    with pytest.raises(TraceError, match=message):
+        Trace.from_steps("a", [], stars=[star])
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ({"gateway": 0, "turn": "right"}, "action.gateway: expected 1 or more"),
+        ({"gateway": 1, "turn": "around"}, "action.gateway: expected 1 or more, for a turn right or left"),
+        ({"bearing": 5}, "action.bearing: expected degrees of a turn , got 5, which is no turn"),
+        ({"bearing": 60, "turn": "left"}, "action.bearing: expected degrees of a turn left, got 60, which is right"),
+        ({"bearing": 60, "kind": "travel"}, "action.bearing: expected degrees clockwise, for a turn"),
+        ({"bearing": "x"}, "action.bearing: expected degrees clockwise"),
+    ],
+)
+def test_a_malformed_turn_is_an_error(action: dict[str, Any], message: str) -> None:
+    with pytest.raises(TraceError, match=message):
+        Action.of({"name": "x", "kind": "turn", **action})
+
+
+def test_gateways_that_could_be_one_are_an_error() -> None:
+    with pytest.raises(TraceError, match="step 0: star: expected gateways that their spreads tell apart, got 0 and 15 degrees"):
+        solve(Trace.from_steps("a", [], stars=[(0, 15)]))
+
+
+@pytest.mark.parametrize(("bearing", "turn"), [(60, "right"), (-60, "left"), (175, "around"), (300, "left")])
+def test_a_bearing_says_which_way_a_turn_goes(bearing: float, turn: str) -> None:
+    assert Action("x", "turn", bearing=bearing).turn == turn
+
+
+def test_a_frame_numbers_gateways_clockwise_from_ahead() -> None:
+    (frame,) = Star.of((240, 355, 120)).frames
+    assert frame.bearings == (355, 120, 240)
+    assert [frame.nth("right", n) for n in (1, 2, 3)] == [1, 2, None]
+    assert [frame.nth("left", n) for n in (1, 2, 3)] == [2, 1, None]
+
+
+# --- how stars may be turned to each other: numbers with a bit a degree against a plain search
+
+
+gateways = st.builds(
+    lambda bearings, spreads, opposite: Frame(
+        tuple(sorted(bearings)),
+        tuple(spreads[: len(bearings)]),
+        tuple(range(len(bearings)))[1::-1] + (None,) * (len(bearings) - 2) if opposite and len(bearings) > 1 else (None,) * len(bearings),
+    ),
+    st.lists(st.integers(0, 35).map(lambda k: 10 * k), max_size=4, unique=True),
+    st.lists(st.sampled_from([0, 10, 25, 90]), min_size=4, max_size=4),
+    st.booleans(),
+)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(gateways, gateways, st.integers(0, 3))
+def test_rotations_are_those_of_a_plain_search(first: Frame, then: Frame, shift: int) -> None:
+    if first.slots != then.slots:
+        assert not judge.rotations(first, then, shift)
+        return
+    shift %= max(first.slots, 1)
+    found = frames.members(frames.rotations(first, then, shift))
+    assert set(found) == judge.rotations(first, then, shift)
+    assert not found or frames.heading(first, then, shift) in found or len(found) == 360
+
+
+# --- the axioms on tiny traces: clingo, the checker and a brute force
+
+
+SHAPES: tuple[tuple[Any, ...], ...] = (
+    (0, 120),
+    (0, 120, 240),
+    (0, 60),
+    (0,),
+    (),
+    (0, 180, 240),
+    (0, 72, 144, 216, 288),
+    ({"bearing": 0}, {"bearing": 120, "opposite": 0}),
+    ({"bearing": 0}, {"bearing": 180, "spread": 90, "open": None}),
+    ({"bearing": 0}, {"bearing": 120}, {"bearing": 240, "open": None}),
+)
+TURNS: tuple[Any, ...] = (
+    *("right", "left", "around"),
+    {"name": "by 60", "kind": "turn", "bearing": 60},
+    {"name": "by 120", "kind": "turn", "bearing": 120},
+    {"name": "first", "kind": "turn", "turn": "right", "gateway": 1},
+    {"name": "second", "kind": "turn", "turn": "left", "gateway": 2},
+)
+# The axioms that may be left out: without a heading of its own a dstate would be turned in several ways.
+LEFT_OUT = ("gateway_frame", "gateway_turn", "gateway_dstate", "gateway_path", "turn_stays", "travel_leaves")
+
+
+@st.composite
+def traces(draw: st.DrawFn) -> Trace:
+    """Two to five observations at places of one or two shapes. Mostly the stars after a turn are those seen before it, turned as the action says."""
+    shapes = draw(st.lists(st.sampled_from(SHAPES), min_size=1, max_size=2))
+    noise = draw(st.sampled_from([0, 0, 7]))
+    steps = draw(st.integers(2, 5))
+    actions = draw(st.lists(st.sampled_from(("travel", *TURNS)), min_size=steps - 1, max_size=steps - 1))
+    shape, heading, stars = draw(st.sampled_from(shapes)), 0, []
+    for action in ("travel", *actions):
+        if action == "travel":
+            shape = draw(st.sampled_from(shapes))
+            heading = draw(st.sampled_from([0, 60, 120, 180]))
+        else:
+            known = {"right": 60, "left": 300, "around": 180}
+            heading += action["bearing"] if isinstance(action, dict) and "bearing" in action else known.get(str(action), 120)
+        seen = []
+        for gateway in shape:
+            given_ = dict(gateway) if isinstance(gateway, dict) else {"bearing": gateway}
+            seen.append({**given_, "bearing": (given_["bearing"] - heading + draw(st.sampled_from([-noise, 0, noise]))) % 360})
+        stars.append(seen)
+    views = draw(st.lists(st.sampled_from("aab"), min_size=steps, max_size=steps))
+    return Trace.from_steps(views, actions, stars=stars)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(traces(), st.data())
+def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.DataObject) -> None:
+    theory = GATEWAYS.replace(
+        boundary=data.draw(st.sampled_from(["none", "strict"])),
+        path_order=data.draw(st.sampled_from(["partial", "total"])),
+        all_on_paths=data.draw(st.booleans()),
+        prefer=data.draw(st.sampled_from([("dstates", "paths", "places"), (), ("places",)])),
+        without=data.draw(st.just(()) | st.sampled_from(LEFT_OUT).map(lambda name: (name,))),
+    )
+    counts, expected = minimal_maps(trace, theory)
+    with patch.object(prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 2, 8]))):
+        solution = solve(trace, theory, maps=0, limit=10)
+    assert solution.complete
+    assert len(solution.maps) == len(expected)
+    assert {key(ssh_map) for ssh_map in solution.maps} == expected
+    assert (solution.cost is None) == (counts is None)
+    assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(traces(), st.sampled_from(LEFT_OUT[:4]))
+def test_checker_rejects_what_the_brute_force_does_not_find(trace: Trace, left_out: str) -> None:
+    """The maps of a theory that lacks an axiom, under the axioms that have it."""
+    _, allowed = minimal_maps(trace, GATEWAYS.replace(prefer=()))
+    for ssh_map in solve(trace, GATEWAYS.replace(prefer=(), without=(left_out,)), maps=20, limit=10).maps:
+        if key(ssh_map) not in allowed:
+            assert check(trace, ssh_map, GATEWAYS)
+
+
+def test_an_opening_not_observed_matches_both() -> None:
+    """Out and back: behind the robot it is unknown, at first, whether there is a gateway."""
+    for back in (0, 1):
+        trace = Trace.from_steps(
+            "abca", ["around", "travel", "around"], stars=[(1, 0, None, 0), (back, 0, 1, 0), (0, 0, 1, 0), (1, 0, 0, 0)]
+        )
+        cost = solve(trace).cost
+        assert cost is not None
+        assert cost.places == 2
+    contradicted = Trace.from_steps("ab", ["around"], stars=[(1, None, 0, 0), (0, 1, 1, 0)])
+    assert solve(contradicted).status is Status.UNSATISFIABLE
+    assert solve(Trace.from_steps("ab", ["around"], stars=[(1, None, 0, 0), (0, 0, 1, 1)])).status is Status.OPTIMAL
+
+
+def test_the_axioms_agree_with_frames_of_four_slots() -> None:
+    """Where turns are named by their bearings, four gateways at right angles are a frame of four slots."""
+    from worlds import TOURS
+    from worlds import drive as drive_streets
+
+    for name in ("square", "tee", "plus"):
+        trace = drive_streets(*TOURS[name], stars=True)
+        framed, general = solve(trace, Theory(star="frame")), solve(trace, Theory(star="gateways"))
+        assert framed.cost == general.cost
+        assert {key(m) for m in framed.maps} == {key(m) for m in general.maps}
+
+
+def test_general_stars_switch_off_what_knows_frames_of_four_slots() -> None:
+    on = Speedups().that_hold_for(GATEWAYS)
+    assert not any((on.names, on.ways, on.framing, on.sides))
+    assert on.prefixes
+    assert on.path_names
+    assert on.threads
+
+
+# --- worlds
+
+
+WORLDS: dict[str, tuple[nx.Graph, int, set[object]]] = {
+    "corners of 60 degrees": (planar.triangle(), 13, set()),
+    "bends of 120 degrees": (planar.hexagon(), 25, {0}),
+    "three gateways, and a hub": (planar.wheel(3), 30, {0}),
+    "three gateways, and dead ends": (planar.junction(0, 120, 240), 16, set()),
+    "five gateways": (planar.junction(0, 72, 144, 216, 288), 30, set()),
+    "five gateways at odd angles": (planar.junction(0, 50, 135, 180, 270), 22, set()),
+    "six gateways": (planar.junction(0, 60, 120, 180, 240, 300), 30, set()),
+}
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_worlds_of_any_gateways_are_mapped_right(name: str) -> None:
+    graph, steps, landmarks = WORLDS[name]
+    start = next(iter(graph))
+    tour = drive(graph, start, next(iter(graph[start])), steps, random.Random(0), landmarks=landmarks)
+    solution = solve(tour.trace, limit=30)
+    assert solution.theory.star == "gateways"
+    assert solution.status is Status.OPTIMAL
+    assert solution.complete
+    assert solution.cost is not None
+    assert solution.cost.places == tour.places
+    for ssh_map in solution.maps:
+        assert ssh_map.labels == tour.labels
+        assert check(tour.trace, ssh_map) == ()
+
+
+@pytest.mark.parametrize(("noise", "unseen"), [(0, False), (8, False), (8, True)])
+def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> None:
+    graph = planar.scattered(6, random.Random(3))
+    tour = drive(graph, 0, next(iter(graph[0])), 24, random.Random(3), noise=noise, unseen=unseen)
+    solution = solve(tour.trace, limit=30)
+    assert solution.status is Status.OPTIMAL
+    assert all(ssh_map.labels == tour.labels for ssh_map in solution.maps)
+    assert solution.cost is not None
+    assert solution.cost.places == tour.places
+
+
+@pytest.mark.parametrize(("spokes", "noise", "unseen"), [(5, 0, False), (6, 0, False), (5, 9, True), (6, 9, True)])
+def test_no_axiom_forbids_the_true_map(spokes: int, noise: float, unseen: bool) -> None:
+    """Hubs with a ring road: bearings may be off by less than their spread, and gateways behind the robot need not be observed."""
+    tour = drive(planar.wheel(spokes), "hub", 0, 24, random.Random(spokes), noise=noise, unseen=unseen)
+    pairs = [(i, j) for j in range(24) for i in range(j)]
+    same = [(i, j) for i, j in pairs if tour.truth[i] == tour.truth[j]]
+    elsewhere = [(i, j) for i, j in pairs if tour.truth[i][0] != tour.truth[j][0]]
+    different = [pair for pair in pairs if pair not in same]
+    asserted = Theory(same=same, different=different, elsewhere=elsewhere, prefer=("dstates", "places", "paths"))
+    solution = solve(tour.trace, asserted, limit=30)
+    assert solution.status is Status.OPTIMAL
+    assert solution.maps[0].labels == tour.labels
+    assert solution.cost is not None
+    assert solution.cost.places == tour.places
+
+
+def test_online_maps_general_stars() -> None:
+    tour = drive(planar.triangle(), 0, 1, 9, random.Random(0))
+    first = tour.trace.steps[0]
+    mapper = OnlineMapper(first.view or "", star=first.star, limit=None)
+    assert mapper.theory.star == "gateways"
+    for t, action in enumerate(tour.trace.actions, 1):
+        step = tour.trace.steps[t]
+        online, whole = mapper.observe(action, step.view or "", star=step.star), solve(tour.trace.prefix(t + 1))
+        assert (online.status, online.cost) == (whole.status, whole.cost)
+        assert set(online.maps) == set(whole.maps)
+
+
+def test_a_star_of_quarters_is_read_as_before() -> None:
+    assert Step(view="a", star=(1, 0, 0, 1)).openings == (True, False, False, True)
+    with pytest.raises(TraceError, match="star=gateways"):
+        _ = Step(view="a", star=(0, 120)).openings
