@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,7 +20,8 @@ from instances import maze
 from strategies import FOREIGN, PAIRS, theories, traces
 from worlds import TOURS, drive, rectangle
 
-from ssh_abduction import Action, OnlineMapper, Solution, Status, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction import Action, Odometry, OnlineMapper, Solution, SSHMap, Status, Step, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction.engines.base import Task
 from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import check
 from ssh_abduction.online import background as guessing
@@ -32,11 +38,17 @@ def follow(
 ) -> tuple[OnlineMapper, list[Solution]]:
     """The mapper at the end of a trace, and its answers after each step."""
     first, *rest = trace.steps
-    mapper = OnlineMapper(first.view or "", theory, star=first.star, limit=limit, maps=maps, speedups=speedups or Speedups())
+    mapper = OnlineMapper(
+        first.view or "", theory, star=first.star, odometry=trace.odometry, limit=limit, maps=maps, speedups=speedups or Speedups()
+    )
     answers = [mapper.solution]
     for action, step in zip(trace.actions, rest, strict=True):
-        answers.append(mapper.observe(action, step.view or "", star=step.star))
+        answers.append(observed(mapper, action, step))
     return mapper, answers
+
+
+def observed(mapper: OnlineMapper, action: Action, step: Step) -> Solution:
+    return mapper.observe(action, step.view or "", star=step.star, displacement=step.displacement, covariance=step.covariance)
 
 
 def agree(trace: Trace, theory: Theory) -> None:
@@ -117,8 +129,8 @@ def test_a_mapper_says_how_far_it_is() -> None:
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(st.data())
 def test_sketches_are_consistent(data: st.DataObject) -> None:
-    trace = data.draw(traces(max_steps=14), label="trace")
-    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS)), label="theory").resolve(trace)
+    trace = data.draw(traces(max_steps=14), label="trace").without_displacements()  # what evidence says, a sketch does not know
+    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory").resolve(trace)
     sketch = data.draw(st.sampled_from(Sketch.all_of(trace.steps[0], theory)), label="sketch")
     for i, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True)):
         assert check(trace.prefix(i + 1), sketch.map(), theory) == ()
@@ -151,8 +163,8 @@ def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.data())
 def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> None:
-    trace = data.draw(traces(max_steps=10), label="trace")
-    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS)), label="theory").resolve(trace)
+    trace = data.draw(traces(max_steps=10), label="trace").without_displacements()  # what evidence says, a sketch does not know
+    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory").resolve(trace)
     draft(trace, theory, data.draw(st.integers(1, len(trace)), label="known"), data.draw(st.integers(0, 4), label="which"))
 
 
@@ -209,10 +221,7 @@ def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
 
 def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
     rest = trace.steps[len(mapper.trace) :]
-    return [
-        mapper.observe(action, step.view or "", star=step.star)
-        for action, step in zip(trace.actions[len(mapper.trace) - 1 :], rest, strict=True)
-    ]
+    return [observed(mapper, action, step) for action, step in zip(trace.actions[len(mapper.trace) - 1 :], rest, strict=True)]
 
 
 def test_maps_are_guessed_while_the_robot_drives() -> None:
@@ -228,7 +237,7 @@ def test_maps_are_guessed_while_the_robot_drives() -> None:
     for i, answer in enumerate(answers, 206):
         assert answer.status is Status.FEASIBLE
         assert check(trace.prefix(i), answer.maps[0], mapper.theory) == ()
-    assert len(answers[0].maps[0].dstates) <= 1.2 * len(set(walk.truth)) < len(mapper._sketches[0].map().dstates)
+    assert len(answers[0].maps[0].dstates) <= 1.2 * len(set(walk.truth)) < len(mapper._sketches[0].sketch.map().dstates)
 
 
 def test_a_map_that_is_contradicted_is_mended() -> None:
@@ -320,6 +329,94 @@ def test_a_step_that_does_not_fit_changes_nothing(action: object, view: object, 
     assert (mapper.solution, mapper.trace, mapper.searches) == (before, other.trace, searches)
     again, expected = (m.observe("around", "b", star=[0, 0, 1, 0]) for m in (mapper, other))
     assert (again.maps, again.status, again.bound) == (expected.maps, expected.status, expected.bound)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"displacement": (1.0, 2.0)}, "step 2: displacement: expected"),
+        ({"displacement": (1.0, math.nan, 0.0)}, r"step 2: displacement\[1\]: expected a finite number"),
+        ({"displacement": (10_000.0, 0.0, 0.0)}, "step 2: displacement: expected metres"),
+        ({"covariance": np.eye(3)}, "step 2: covariance: expected a displacement that it belongs to"),
+        (
+            {"displacement": (1.0, 0.0, 0.0), "covariance": np.diag([1.0, 1.0, -1.0])},
+            "step 2: covariance: expected a positive definite matrix",
+        ),
+    ],
+)
+def test_a_displacement_that_is_none_changes_nothing(given: dict[str, Any], message: str) -> None:
+    trace = Trace.from_steps("ab", ["travel"], displacements=[(1.0, 0.0, 0.0)])
+    mapper, other = (follow(trace, Theory())[0] for _ in range(2))
+    before = mapper.solution
+    with pytest.raises(TraceError, match=message):
+        mapper.observe("travel", "a", **given)
+    assert (mapper.solution, mapper.trace, mapper.theory) == (before, other.trace, other.theory)
+    again, expected = (m.observe("travel", "a", displacement=(1.0, 0.0, 0.0), covariance=np.eye(3)) for m in (mapper, other))
+    assert (again.maps, again.status, again.theory) == (expected.maps, expected.status, expected.theory)
+    with pytest.raises(TraceError, match=r"odometry\.along: expected a number"):
+        OnlineMapper("a", odometry={"along": -1})
+
+
+@pytest.mark.parametrize(
+    ("theory", "stars", "steps"), [(Theory(), True, 30), (Theory(), False, 16), (Theory.causal(), False, 24), (Theory(joint=1), True, 24)]
+)
+def test_the_trace_settles_displacements_as_it_grows(theory: Theory, stars: bool, steps: int) -> None:
+    """The first displacement comes late, and one is missing; the number of returns that may be true doubles several times."""
+    trace = maze(2, 2, steps=steps, seed=3, stars=stars, odometry=Odometry(along=0.02)).trace
+    missing = {1, 2, 3, steps // 2}
+    trace = replace(trace, steps=tuple(replace(step, displacement=None) if t in missing else step for t, step in enumerate(trace)))
+    _, answers = follow(trace, theory)
+    for i in (0, 3, 4, *range(5, steps + 1, 3)):
+        answer, anew = answers[i], solve(trace.prefix(i + 1), theory, maps=0)
+        assert (answer.theory, answer.status, answer.complete, answer.bound) == (anew.theory, anew.status, True, anew.bound)
+        assert set(answer.maps) == set(anew.maps)
+        assert {name: said["pairs"] for name, said in answer.evidence.items()} == {
+            name: said["pairs"] for name, said in anew.evidence.items()
+        }
+    assert [answer.theory.displacement for answer in answers[:6]] == ["none"] * 4 + ["use"] * 2
+    assert answers[3].theory.prefer[-1] == ("dstates" if theory.level == "causal" else "places")
+    assert answers[4].theory.prefer[-1] == ("dstates" if theory.level == "causal" else "paths")
+    assert len({answer.theory.returns for answer in answers}) > 4
+
+
+def test_displacements_may_be_asked_for_before_the_first_one_comes() -> None:
+    trace = maze(2, 2, steps=12, seed=0, odometry=Odometry()).trace
+    theory = Theory(displacement="use", star="none")
+    mapper, answers = follow(trace, theory)
+    assert answers[0].theory == theory.replace(returns=1).resolve(trace.prefix(1))
+    assert set(answers[-1].maps) == set(solve(trace, theory, maps=0).maps)
+    assert mapper.theory == theory.resolve(trace)
+    assert follow(trace, Theory(displacement="none"))[0].theory.displacement == "none"
+
+
+def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
+    """Without time for clingo, all maps are guessed or sketched, and displacements refuse none of them: not even those of steps before the threshold changed."""
+    trace = maze(4, 4, steps=80, seed=1, stars=True, odometry=Odometry(along=0.02)).trace
+    given: list[Trace] = []
+
+    def guessed_map(trace: Trace, *others: Any) -> SSHMap | None:
+        given.append(trace)
+        return guessing.FramedEngine(Task.of(trace, others[0])).map_of_guess().map  # type: ignore[union-attr]
+
+    def at_once(function: Callable[..., SSHMap | None], *args: Any, watch: object) -> SSHMap | None:
+        return (guessed_map if function is guessing.guessed_map else function)(*args)
+
+    with (
+        patch.object(guessing, "has_processors", lambda _: True),
+        patch.object(guessing, "in_process", at_once),
+        patch.object(online, "GUESSED", 50),
+    ):
+        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, odometry=trace.odometry, limit=NO_TIME)
+        for action, step in zip(trace.actions, trace.steps[1:], strict=True):
+            answer = observed(mapper, action, step)
+            assert answer.status is Status.FEASIBLE
+            if answer.steps % 10 == 1:
+                assert check(trace.prefix(answer.steps), answer.maps[0], mapper.theory) == ()
+            if mapper._guess:
+                mapper._guess.map()
+    assert given
+    assert all(seen.odometry == trace.odometry for seen in given)
+    assert len(answer.maps[0].dstates) < len(mapper._sketches[0].sketch.map().dstates)
 
 
 def test_the_first_step_settles_the_stars() -> None:

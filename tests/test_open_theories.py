@@ -63,13 +63,13 @@ def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.Dat
             if mapper is None:
                 first = trace.steps[0]
                 assert first.view is not None
-                mapper = OnlineMapper(first.view, theory, star=first.star, limit=None, maps=0)
+                mapper = OnlineMapper(first.view, theory, star=first.star, odometry=trace.odometry, limit=None, maps=0)
                 online = mapper.solution
             else:
                 step, before = trace.steps[steps - 1], trace.steps[steps - 2].action
                 assert step.view is not None
                 assert before is not None
-                online = mapper.observe(before, step.view, star=step.star)
+                online = mapper.observe(before, step.view, star=step.star, displacement=step.displacement, covariance=step.covariance)
             for solution in (online, solve(prefix, theory, maps=0)):
                 assert solution.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
                 assert {key(ssh_map) for ssh_map in solution.maps} == expected

@@ -18,6 +18,7 @@ from ssh_abduction.asp.process import in_process
 from ssh_abduction.engines.base import Task
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.odometry import Odometry
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Step, Trace
@@ -41,21 +42,26 @@ class MapGuess:
 
     A map is made of a guess, unless one is known. As the trace has grown meanwhile, and may contradict it, it is mended at the end.
 
-    steps  those of the trace so far; more may be appended
+    steps     those of the trace so far; more may be appended
+    odometry  of the trace
     """
 
-    def __init__(self, steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None = None) -> None:
+    def __init__(
+        self, steps: Sequence[Step], odometry: Odometry | None, theory: Theory, speedups: Speedups, known: SSHMap | None = None
+    ) -> None:
         self._found: Future[SSHMap | None] = Future()
         watch = Watch()
-        thread = threading.Thread(target=_make, args=(steps, theory, speedups, known, watch, self._found), daemon=True)
+        thread = threading.Thread(target=_make, args=(steps, odometry, theory, speedups, known, watch, self._found), daemon=True)
         weakref.finalize(self, _end, watch, thread)
         thread.start()
 
     @staticmethod
-    def begun(steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None = None) -> MapGuess | None:
+    def begun(
+        steps: Sequence[Step], odometry: Odometry | None, theory: Theory, speedups: Speedups, known: SSHMap | None = None
+    ) -> MapGuess | None:
         """None where there is no second processor, or guesses are not wanted."""
         wanted = speedups.annealed and speedups.processes and has_processors(speedups)
-        return MapGuess(steps, theory, speedups, known) if wanted else None
+        return MapGuess(steps, odometry, theory, speedups, known) if wanted else None
 
     def done(self) -> bool:
         return self._found.done()
@@ -66,12 +72,18 @@ class MapGuess:
 
 
 def _make(
-    steps: Sequence[Step], theory: Theory, speedups: Speedups, known: SSHMap | None, watch: Watch, found: Future[SSHMap | None]
+    steps: Sequence[Step],
+    odometry: Odometry | None,
+    theory: Theory,
+    speedups: Speedups,
+    known: SSHMap | None,
+    watch: Watch,
+    found: Future[SSHMap | None],
 ) -> None:
     try:
-        known = known or in_process(guessed_map, Trace(tuple(steps)), theory, speedups, watch=watch)
+        known = known or in_process(guessed_map, Trace(tuple(steps), odometry=odometry), theory, speedups, watch=watch)
         if known and len(steps) > len(known.labels):
-            known = in_process(mended_map, Trace(tuple(steps)), theory, known, speedups, watch=watch)
+            known = in_process(mended_map, Trace(tuple(steps), odometry=odometry), theory, known, speedups, watch=watch)
         found.set_result(known)
     except LimitError:
         found.set_result(None)

@@ -23,6 +23,16 @@ the replayed R, by (3). ∎
 Else clingo is asked, in the one control that is kept: for all maps of cost c if some map of M predicts the step, else for the minimum,
 which is at least what was proved before. A theory for which prefixes are not exact (`theory/speedups.py`) is solved anew at each step.
 
+*Evidence* may say of the new step that it is not where a map predicts it, or that it cannot be there together with other returns. Such a map is contradicted,
+too, and the proof stays the same: what evidence says of fewer steps, it says of more. So only returns to the new step are asked about.
+
+A theory that the trace unsettles
+---------------------------------
+Two things are settled by the whole trace, and so may change as it grows. Displacements are used from the first one on, and then places are preferred to
+paths; and the chance to refuse a true map is shared among as many returns as may be true, a number that is rounded up to a power of two. Where that changes, minimal
+maps of fewer steps need not be so any more: they are sought anew, which happens for each doubling of that number once. Then less is refused, so
+maps of the steps before go on as drafts.
+
 When time is short
 ------------------
 A map that predicts the step is minimal even if there is no time to look for others. Once there is none, the answer is feasible: the last
@@ -40,7 +50,8 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.asp.limits import check_limit
@@ -49,11 +60,13 @@ from ssh_abduction.errors import TraceError, brief
 from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import check, unchecked
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.odometry import Odometry
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.result import Seconds, Solution, Status
 from ssh_abduction.solver.search import ALL, Search
 from ssh_abduction.steps.log import Outcome, observation
-from ssh_abduction.theory.evidence import Pairs, pairs_of
+from ssh_abduction.theory.evidence import NO_PAIRS, Pairs, evidence_of, pairs_of
+from ssh_abduction.theory.evidence.displacement import count_returns
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Action, Step, Trace, View
@@ -79,8 +92,9 @@ class OnlineMapper:
     """Keeps the minimal maps current while a robot drives. `solution` is the answer for the steps so far.
 
     view     what is seen at first
-    theory   which axioms and which preference; Theory.topological() by default. The first step settles star=auto
+    theory   which axioms and which preference; Theory.topological() by default. The first step settles star=auto, the first displacement displacement=auto
     star     the openings seen at first, as in Step, if the theory uses stars
+    odometry  how far displacements that come without a covariance may be off, as in Trace; None for the defaults
     limit    seconds that a step may take, about: clingo cannot be stopped while it grounds a step. None waits for the exact answer
     maps     keep at most so many maps; 0 keeps all
     speedups  what makes solving fast, as for Search
@@ -92,6 +106,7 @@ class OnlineMapper:
         theory: Theory | None = None,
         *,
         star: Sequence[float] | None = None,
+        odometry: Odometry | Mapping[str, Any] | None = None,
         limit: float | None = 0.5,
         maps: int = 100,
         speedups: Speedups = ALL,
@@ -100,78 +115,130 @@ class OnlineMapper:
         theory = checked_theory(theory)
         check_limit("limit", "seconds", limit)
         checked_speedups(speedups)
-        self.theory = theory.resolve(Trace((first,)))
+        self._odometry = None if odometry is None else Odometry.of(odometry)
+        self.trace = Trace((first,), odometry=self._odometry)  # the steps so far
+        settled = theory.replace(displacement="none").resolve(self.trace)  # of displacements the first step says nothing
+        self._without_stars = theory.star == "auto" and settled.star == "none"
+        self._unsettled = theory.replace(star=settled.star)
         if theory.level == "causal":  # now rather than at the step that first needs it, as it takes its time
             importlib.import_module("ssh_abduction.engines.causal")
-        elif row("visits").holds_for(self.theory):
+        elif row("visits").holds_for(settled):
             importlib.import_module("ssh_abduction.online.background")
         began = time.perf_counter()
         self.searches = 0  # how often clingo was asked
-        self._without_stars = theory.star == "auto" and self.theory.star == "none"
         self._limit, self._most, self._speedups = limit, maps, speedups
-        self._pairs = pairs_of(Trace((first,)), self.theory)
-        self._replays = row("prefixes").holds_for(self.theory)
-        self._may_mend = row("visits").holds_for(self.theory)
-        self._may_sketch = self._replays and not unchecked(self.theory)
-        self._trusts_sketches = row("certain sketches").holds_for(self.theory)
         self._steps = [first]
-        self._seen = [observation(first, self.theory)]
+        self._seen = [observation(first, settled)]
         self._actions: dict[str, Action] = {}
+        self._guess: MapGuess | None = None
+        self._next_guess = GUESSED  # not before the trace has so many steps
+        self._mending = MENDING  # seconds, by the square of the number of steps
+        self._begin_with(self._settled_theory())
+        self._ask()
+        self.solution = self._answer(began)
+
+    def _begin_with(self, theory: Theory) -> None:
+        """Begin anew, with nothing known of the maps of the steps so far but sketches."""
+        self.theory = theory
+        self._evidence = evidence_of(theory)
+        # What evidence says is asked of evidence itself, as sketches grow; of all else they are certain, or the checker is asked.
+        self._without_evidence = theory.replace(without=(*theory.without, *(kind.axiom for kind in self._evidence)))
+        self._replays = row("prefixes").holds_for(theory)
+        self._may_mend = row("visits").holds_for(theory)
+        self._may_sketch = self._replays and not unchecked(theory)
+        self._trusts_sketches = row("certain sketches").holds_for(self._without_evidence)
+        self._pairs = NO_PAIRS
         self._status = Status.UNKNOWN
         self._complete = False
         self._cost: Cost | None = None
         self._maps: list[_Replayed] = []
-        self._drafts: list[Sketch] = []  # beyond maps of fewer steps, the best first
-        self._sketches = Sketch.all_of(first, self.theory)
-        self._guess: MapGuess | None = None
-        self._next_guess = GUESSED  # not before the trace has so many steps
-        self._mending = MENDING  # seconds, by the square of the number of steps
+        self._drafts: list[_Draft] = []  # beyond maps of fewer steps, the best first
+        self._sketches = [_Draft(sketch) for sketch in Sketch.all_of(self._steps[0], theory)]
+        for before, step in pairwise(self._steps):
+            assert before.action
+            self._sketches = [draft for draft in self._sketches if draft.sketch.extend(before.action, step)]
         self._search: Search | None = None
         self._asked: Solution | None = None  # what it said
         self._next_search = 0  # not before the trace has so many steps
-        self._judging = Judging(Trace((first,)), self.theory)
-        self._spent = 0.0  # seconds that all steps took
-        self._ask()
-        self.solution = self._answer(began)
+        self._judging = Judging(self.trace, theory)
+        self._spent = 0.0  # seconds that all steps took since
+
+    def _settled_theory(self) -> Theory:
+        """The theory as the trace so far settles it."""
+        theory = self._unsettled
+        if theory.displacement == "auto":
+            theory = theory.replace(displacement="use" if self.trace.has_displacements else "none")
+        if theory.displacement == "use" and not theory.returns:
+            theory = theory.replace(returns=count_returns(self.trace, theory))
+        return theory.resolve(self.trace.prefix(1))
+
+    def _is_settled(self) -> bool:
+        """Whether the theory is still as the trace so far settles it."""
+        if self.theory.displacement == "none":
+            return self._unsettled.displacement == "none" or self._steps[-1].displacement is None
+        return bool(self._unsettled.returns) or self.theory.returns == count_returns(self.trace, self.theory)
 
     def __repr__(self) -> str:
         cost = self.solution.cost
         return f"<OnlineMapper: {len(self._steps)} steps, {self.solution.status.value}, {cost.dstates if cost else 'no'} dstates>"
 
-    @property
-    def trace(self) -> Trace:
-        """The steps so far."""
-        return Trace(tuple(self._steps))
-
-    def observe(self, action: Action | str | Mapping[str, Any], view: View, *, star: Sequence[float] | None = None) -> Solution:
+    def observe(
+        self,
+        action: Action | str | Mapping[str, Any],
+        view: View,
+        *,
+        star: Sequence[float] | None = None,
+        displacement: Sequence[float] | None = None,
+        covariance: Sequence[Sequence[float]] | None = None,
+    ) -> Solution:
         """Take in an action and what was seen then, and say what the minimal maps are now.
+
+        displacement  [dx, dy, dtheta] of the action, in metres and radians, as in Step; None where it is not known
+        covariance    of the displacement, (3, 3); None where the odometry tells it
 
         Raises TraceError where the step does not fit theory and trace; the mapper stays as it was.
         """
         began = time.perf_counter()
-        self._take(Action.of(action), view, star, began)
+        done = Action.of(action)
+        step = Step.of(view, star, f"step {len(self._steps)}", displacement=displacement, covariance=covariance)
+        self._take(done, step, began)
         self.solution = self._answer(began)
         return self.solution
 
-    def _take(self, action: Action, view: View, star: Sequence[float] | None, began: float) -> None:
+    def _take(self, action: Action, step: Step, began: float) -> None:
         """Take in a step."""
-        step = Step.of(view, star, f"step {len(self._steps)}")
         last = replace(self._steps[-1], action=action)
         self._check(action, last, step)
         self._actions[action.name] = action
         self._steps[-1:] = [last, step]
         self._seen.append(observation(step, self.theory))
-        if self._status is not Status.UNSATISFIABLE or not self._replays:
-            known = self.solution.maps[0] if self._maps or self._drafts else None
+        self.trace = Trace(tuple(self._steps), odometry=self._odometry)
+        known = self.solution.maps[0] if self._maps or self._drafts else None
+        if self._is_settled():
+            if self._status is Status.UNSATISFIABLE and self._replays:
+                return
             self._replay(action, step)
-            if not self._settled() and len(self._steps) >= self._next_search:
-                self._ask()
-            self._absorb_guess()
-            if self._may_guess():
-                contradicted = known if not self._drafts else None
-                mended = contradicted is not None and self._mend(contradicted, began)
-                if not self._guess and not mended and (contradicted or len(self._steps) >= self._next_guess):
-                    self._begin_guess(contradicted)
+        else:
+            self._settle_anew()
+        if not self._settled() and len(self._steps) >= self._next_search:
+            self._ask()
+        self._absorb_guess()
+        if self._may_guess():
+            contradicted = known if not self._drafts else None
+            mended = contradicted is not None and self._mend(contradicted, began)
+            if not self._guess and not mended and (contradicted or len(self._steps) >= self._next_guess):
+                self._begin_guess(contradicted)
+
+    def _settle_anew(self) -> None:
+        """Begin anew, with the theory that the trace so far settles. Maps of the steps before go on as drafts, if they were judged by displacements, too."""
+        uses, steps = self.theory.displacement == "use", len(self._steps) - 1
+        known = [m.map() for m in self._maps[:DRAFTS]] + [draft.sketch.map() for draft in self._drafts]
+        self._begin_with(self._settled_theory())
+        self._pairs = pairs_of(self.trace, self.theory)
+        for ssh_map in known if uses else ():
+            self._draft(ssh_map, steps)
+        if not uses:
+            self._guess = None
 
     def _check(self, action: Action, last: Step, step: Step) -> None:
         """Whether a step fits the theory and the steps before."""
@@ -189,11 +256,12 @@ class OnlineMapper:
 
     def _replay(self, action: Action, step: Step) -> None:
         """Keep the maps that predict the step."""
-        outcomes = [m.follow(action.name, self._seen[-1]) for m in self._maps]
+        self._pairs = pairs_of(self.trace, self.theory)
+        outcomes = [self._outcome(m, action) for m in self._maps]
         lost = [m for m, outcome in zip(self._maps, outcomes, strict=True) if outcome is Outcome.UNKNOWN]
         self._maps = [m for m, outcome in zip(self._maps, outcomes, strict=True) if outcome is Outcome.PREDICTED]
-        self._drafts = [s for s in self._drafts if s.extend(action, step)]
-        self._sketches = [s for s in self._sketches if s.extend(action, step)]
+        self._drafts = [draft for draft in self._drafts if draft.sketch.extend(action, step)]
+        self._sketches = [draft for draft in self._sketches if draft.sketch.extend(action, step)]
         self._complete = self._complete and Outcome.UNKNOWN not in outcomes
         if not self._replays:
             self._maps = []
@@ -204,6 +272,13 @@ class OnlineMapper:
             for m in lost[:DRAFTS]:
                 self._draft(m.map(), len(self._steps) - 1)
 
+    def _outcome(self, replayed: _Replayed, action: Action) -> Outcome:
+        """What a map and evidence say of the last step."""
+        outcome = replayed.follow(action.name, self._seen[-1], self._pairs)
+        if outcome is Outcome.PREDICTED and not self._judging.allows_grown(self.trace, replayed.map(), len(self._steps) - 1):
+            return Outcome.CONTRADICTED
+        return outcome
+
     def _draft(self, ssh_map: SSHMap, steps: int) -> None:
         """Let a map of so many steps go on like a sketch, unless it contradicts the steps since."""
         if not self._may_sketch:
@@ -211,7 +286,7 @@ class OnlineMapper:
         sketch = Sketch.beyond(ssh_map, self.trace.prefix(steps), self.theory)
         since = zip(self._steps[steps - 1 :], self._steps[steps:], strict=False)
         if all(sketch.extend(before.action, step) for before, step in since if before.action):
-            self._drafts = sorted([*self._drafts, sketch], key=self._rank)[:DRAFTS]
+            self._drafts = sorted([*self._drafts, _Draft(sketch)], key=self._rank)[:DRAFTS]
 
     def _mend(self, ssh_map: SSHMap, began: float) -> bool:
         """Let a map of fewer steps that the last ones contradict go on, with what does not fit as something new. False where there is no time for that."""
@@ -227,8 +302,8 @@ class OnlineMapper:
             self._draft(mended, steps)
         return True
 
-    def _rank(self, sketch: Sketch) -> tuple[int, ...]:
-        return Cost.of(sketch.map()).preferred_by(self.theory)
+    def _rank(self, draft: _Draft) -> tuple[int, ...]:
+        return Cost.of(draft.sketch.map()).preferred_by(self.theory)
 
     def _may_guess(self) -> bool:
         """Whether a small map is wanted, and the steps are not too many to be compared in pairs."""
@@ -248,7 +323,7 @@ class OnlineMapper:
 
         if not known:
             self._next_guess = int(GUESS_AGAIN * len(self._steps))
-        self._guess = MapGuess.begun(self._steps, self.theory, self._speedups, known)
+        self._guess = MapGuess.begun(self._steps, self._odometry, self.theory, self._speedups, known)
 
     def _settled(self) -> bool:
         """Whether clingo could add nothing."""
@@ -261,7 +336,7 @@ class OnlineMapper:
         search = Search(
             self.trace, self.theory, limit=self._limit, maps=self._most, speedups=self._speedups, after=self._search, minimal=known
         )
-        found = tuple(search)
+        found = tuple(search.unranked())  # as that takes longer than a step may
         self._search = search
         steps = len(self._steps)
         self._next_search = max(steps + PAUSE, int(RETRY * steps)) if search.stopped in ("time limit", "interrupted") else 0
@@ -270,7 +345,7 @@ class OnlineMapper:
             self._status, self._complete, self._cost = search.status, search.complete, self._asked.cost
             self._drafts = []
             if len(found) >= len(self._maps) or known is None:
-                self._maps = [_Replayed(m, self._seen, self._pairs) for m in found]
+                self._maps = [_Replayed(m, self._seen) for m in found]
         elif found:
             self._draft(found[0], steps)
 
@@ -278,8 +353,8 @@ class OnlineMapper:
         assert self._search is not None
         assert self._asked is not None
         status, cost, maps = self._status, self._cost, tuple(m.map() for m in self._maps)
-        if status is Status.UNKNOWN and (sketch := self._best_sketch()):
-            maps = (sketch.map(),)
+        if status is Status.UNKNOWN and (draft := self._best_draft()):
+            maps = (draft.sketch.map(),)
             status, cost = Status.FEASIBLE, Cost.of(maps[0])
         self._spent += time.perf_counter() - began
         if maps and self._judging.has_time_for(len(self._steps), self._spent):
@@ -298,48 +373,74 @@ class OnlineMapper:
             basis=last.basis,
             seconds=Seconds(time.perf_counter() - began, last.seconds.ground if asked else 0.0, last.seconds.solve if asked else 0.0),
             stopped=None if self._complete else self._search.stopped,
+            evidence=self._said_by_evidence(last),
         )
 
-    def _best_sketch(self) -> Sketch | None:
-        """The best draft that the checker finds consistent, or else a sketch of all steps, if there is one."""
+    def _said_by_evidence(self, asked: Solution) -> dict[str, dict[str, int]]:
+        """As in Solution: how many pairs of steps each kind of evidence excludes, and how many sets of equalities it refused when clingo was asked."""
+        kinds = ((kind.name, kind.pairs(self.trace)) for kind in self._evidence)
+        return {
+            name: {"pairs": sum(map(len, pairs.apart.values())), "refused": asked.evidence.get(name, {}).get("refused", 0)}
+            for name, pairs in kinds
+        }
+
+    def _best_draft(self) -> _Draft | None:
+        """The best draft that is consistent, or else a sketch of all steps, if there is one."""
         while self._drafts:
-            draft = self._drafts[0]
-            if self._is_consistent(draft):
-                return draft
+            if self._is_consistent(self._drafts[0]):
+                return self._drafts[0]
             del self._drafts[0]
         return next(filter(self._is_consistent, self._sketches), None) if self._may_sketch else None
 
-    def _is_consistent(self, sketch: Sketch) -> bool:
-        """Whether a sketch is consistent: as it is made so, or by the checker."""
+    def _is_consistent(self, draft: _Draft) -> bool:
+        """Whether a draft is consistent: by evidence, and else as it is made so, or by the checker."""
+        sketch, steps = draft.sketch, len(self._steps)
+        if self._evidence and draft.passed < steps:
+            ssh_map = sketch.map()
+            place_of = [s.place for s in ssh_map.dstates]
+            if not all(self._pairs.allow(t, sketch.labels, place_of) for t in range(draft.passed, steps)):
+                return False
+            if not self._judging.allows_grown(self.trace, ssh_map, draft.passed):
+                return False
+            draft.passed = steps
         if not sketch.certain or not self._trusts_sketches:
-            sketch.certain = not check(self.trace, sketch.map(), self.theory)
+            sketch.certain = not check(self.trace, sketch.map(), self._without_evidence)
         return sketch.certain
+
+
+@dataclass(slots=True)
+class _Draft:
+    """A sketch, and how many of its first steps make a map that no evidence refuses."""
+
+    sketch: Sketch
+    passed: int = 0
 
 
 class _Replayed:
     """A map, with the labels of the steps that it has predicted since."""
 
-    def __init__(self, ssh_map: SSHMap, seen: Sequence[object], pairs: Pairs) -> None:
+    def __init__(self, ssh_map: SSHMap, seen: Sequence[object]) -> None:
         self._map = ssh_map
-        self._pairs = pairs
         self._place_of = [s.place for s in ssh_map.dstates]
         self._labels = list(ssh_map.labels)
         self._links = {(s, action): x for s, action, x in ssh_map.links}
         self._sights = dict(zip(self._labels, seen, strict=True))
 
-    def follow(self, action: str, seen: object) -> Outcome:
-        """What the map says of a step."""
+    def follow(self, action: str, seen: object, pairs: Pairs) -> Outcome:
+        """What the map says of a step, and what evidence says of the pairs of this step with earlier ones."""
         there = self._links.get((self._labels[-1], action))
         if there is None:
             return Outcome.UNKNOWN
         if self._sights[there] != seen:
             return Outcome.CONTRADICTED
         self._labels.append(there)
-        if not self._pairs.allow(len(self._labels) - 1, self._labels, self._place_of):
+        if not pairs.allow(len(self._labels) - 1, self._labels, self._place_of):
             self._labels.pop()
             return Outcome.CONTRADICTED
         return Outcome.PREDICTED
 
     def map(self) -> SSHMap:
         """The map of all steps so far."""
-        return replace(self._map, labels=tuple(self._labels))
+        if len(self._map.labels) < len(self._labels):
+            self._map = replace(self._map, labels=tuple(self._labels))
+        return self._map

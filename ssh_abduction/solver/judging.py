@@ -60,6 +60,14 @@ class Judging:
                 return {evidence.name: found}
         return {}
 
+    def allows_grown(self, trace: Trace, ssh_map: SSHMap, since: int) -> bool:
+        """Whether no evidence refuses a map of a trace that has grown.
+
+        since  the map of so many first steps was refused by none
+        """
+        self._trace = trace
+        return not any(evidence.refuse(trace, ssh_map, since) for evidence in self._evidence)
+
     def accepts(self, ssh_map: SSHMap) -> bool:
         """Whether a map of the whole trace that nothing proves yet is known to satisfy all axioms."""
         accepted = not unchecked(self._theory) and not check(self._trace, ssh_map, self._theory) and not self.why_refused(ssh_map)

@@ -268,7 +268,13 @@ class Search:
         return self._near.engine if self._near else self._prefixes.engine
 
     def __iter__(self) -> Iterator[SSHMap]:
-        ranking = Ranking(self.trace) if self.theory.displacement == "use" else None
+        return self._listed(Ranking(self.trace) if self.theory.displacement == "use" else None)
+
+    def unranked(self) -> Iterator[SSHMap]:
+        """As by iteration, but in the order in which maps are found, and without how well they close, which takes its time."""
+        return self._listed(None)
+
+    def _listed(self, ranking: Ranking | None) -> Iterator[SSHMap]:
         for cost, level in groupby(self._found(), key=lambda _: self._cost):
             for ssh_map in ranking.ranked(level, self.over) if ranking else level:
                 self._take_down(ssh_map, cost)

@@ -32,5 +32,5 @@ class Asserted:
     def facts(self, trace: Trace, start: int, stop: int) -> str:
         return ""
 
-    def refuse(self, trace: Trace, ssh_map: SSHMap) -> frozenset[Equality] | None:
+    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         return None

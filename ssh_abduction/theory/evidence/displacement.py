@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import is_
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
@@ -108,7 +108,7 @@ def _has_grown(before: Trace, trace: Trace) -> bool:
 
 def count_returns(trace: Trace, theory: Theory) -> int:
     """How many returns of a trace may be true, rounded up to a power of two. A trace may be as long as it likes, and have as few."""
-    return _returns(Displacement.of(theory.replace(returns=0)), trace).count()
+    return _returns(replace(Displacement.of(theory), returns=0), trace).count()
 
 
 class Returns:

@@ -83,10 +83,12 @@ class Planar:
     def facts(self, trace: Trace, start: int, stop: int) -> str:
         return ""
 
-    def refuse(self, trace: Trace, ssh_map: SSHMap) -> frozenset[Equality] | None:
+    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         places = [ssh_map.dstates[label].place for label in ssh_map.labels]
         labels: Mapping[int, int] = dict(enumerate(ssh_map.labels))
         moves = _first_moves(trace, ssh_map.labels)
+        if since and all(t + 1 < since for t in moves):  # what the map is since then, it was before
+            return None
         at = {t: place for t, place in enumerate(places) if place is not None}
         if len(at) < len(places) or not self._cross(trace, moves, labels, at, self.distinct):
             return None

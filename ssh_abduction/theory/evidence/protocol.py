@@ -42,6 +42,9 @@ class Evidence(Protocol):
         """What else its encoding reads, of steps `start` to `stop - 1`."""
         ...
 
-    def refuse(self, trace: Trace, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """A small set of equalities of a map of the first steps, and of what is not equal (`holds` is False), that cannot all hold, whatever the map; None if there is none."""
+    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
+        """A small set of equalities of a map of the first steps, and of what is not equal (`holds` is False), that cannot all hold, whatever the map; None if there is none.
+
+        since  the map of the steps before this one is known to be a map of these that is not refused, so that it need not be asked about again
+        """
         ...
