@@ -49,7 +49,7 @@ def circuit(
     return Trace.from_steps(views, ["travel", "right"] * sides, displacements=moved, odometry=odometry)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(st.data())
 def test_solver_and_checker_agree_with_matrices_written_out(data: st.DataObject) -> None:
     trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")

@@ -139,7 +139,7 @@ gateways = st.builds(
 )
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=70, deadline=None, derandomize=True)
 @given(gateways, gateways, st.integers(0, 3))
 def test_rotations_are_those_of_a_plain_search(first: Frame, then: Frame, shift: int) -> None:
     if first.slots != then.slots:
@@ -201,7 +201,7 @@ def traces(draw: st.DrawFn) -> Trace:
     return Trace.from_steps(views, actions, stars=stars)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(traces(), st.data())
 def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.DataObject) -> None:
     theory = GATEWAYS.replace(
@@ -221,7 +221,7 @@ def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.Da
     assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(traces(), st.sampled_from(LEFT_OUT[:4]))
 def test_checker_rejects_what_the_brute_force_does_not_find(trace: Trace, left_out: str) -> None:
     """The maps of a theory that lacks an axiom, under the axioms that have it."""

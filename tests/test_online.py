@@ -65,7 +65,7 @@ def agree(trace: Trace, theory: Theory) -> None:
             assert getattr(answer.cost, name) == getattr(anew.cost, name)
 
 
-@settings(max_examples=35, deadline=None, derandomize=True)
+@settings(max_examples=20, deadline=None, derandomize=True)
 @given(st.data())
 def test_after_every_step_the_answer_is_that_of_solving_anew(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=9), label="trace")
@@ -77,7 +77,7 @@ def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
     agree(Trace.from_steps("abaabb", ["travel", "around", "travel", "right", "travel"]), Theory(without=(name,)))
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=20, deadline=None, derandomize=True)
 @given(st.data())
 def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
@@ -126,7 +126,7 @@ def test_a_mapper_says_how_far_it_is() -> None:
     assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.data())
 def test_sketches_are_consistent(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=14), label="trace").without_displacements()  # what evidence says, a sketch does not know
@@ -160,7 +160,7 @@ def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
     return doubts
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=50, deadline=None, derandomize=True)
 @given(st.data())
 def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=10), label="trace").without_displacements()  # what evidence says, a sketch does not know

@@ -216,7 +216,7 @@ def loose(data: st.DataObject, trace: Trace) -> Theory:
     )
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(data=st.data())
 def test_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(winding(), label="trace")
