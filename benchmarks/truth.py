@@ -28,7 +28,7 @@ from instances import displaced, maze
 from simulator.motion import Pose
 from simulator.plans import Plan, tour
 from simulator.robot import Body
-from ssh_abduction import Odometry, Theory, Trace, solve
+from ssh_abduction import Odometry, Solution, Status, Theory, Trace, solve
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.odometry import NUMBERS
 
@@ -67,9 +67,9 @@ def partition(names: Sequence[Hashable]) -> tuple[int, ...]:
 
 
 def is_true(ssh_map: SSHMap, known: Known) -> bool:
-    """Whether the labels of a map are the true dstates, and the places of its labels the true places, both up to renaming."""
+    """Whether the labels of a map are the true dstates, and the places of its labels, if it has any, the true places, both up to renaming."""
     places = [ssh_map.dstates[label].place for label in ssh_map.labels]
-    return partition(ssh_map.labels) == partition(known.dstates) and partition(places) == partition(known.places)
+    return partition(ssh_map.labels) == partition(known.dstates) and (not ssh_map.places or partition(places) == partition(known.places))
 
 
 def mazes(cells: int, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
@@ -131,15 +131,24 @@ def row(known: Known, theory: Theory, limit: float) -> tuple[str, bool, float]:
     solution = solve(known.trace, theory, limit=limit)
     seconds = time.perf_counter() - began
     right = [is_true(ssh_map, known) for ssh_map in solution.maps]
-    all_true = solution.complete and bool(right) and all(right)
+    all_true = bool(right) and all(right) and (solution.complete or share_all(solution))
     cost = f"{solution.cost.dstates}, {solution.cost.places}, {solution.cost.paths}" if solution.cost else "–"
     truth = f"{len(set(known.dstates))}, {len(set(known.places))}"
-    listed = f"{sum(right)} of {len(right)}{'' if solution.complete else ' or more'}"
+    more = "" if solution.complete else " or more, all alike" if all_true else " or more"
+    listed = f"{sum(right)} of {len(right)}{more}"
     return (
         f"| {known.name} | {len(known.trace)} | {truth} | {solution.status.value} | {cost} | {listed} | {seconds:.2f} |",
         all_true,
         seconds,
     )
+
+
+def share_all(solution: Solution) -> bool:
+    """Whether all minimal maps, of which only some are listed, have the same dstates and the same places: then they differ in paths alone."""
+    if solution.status is not Status.OPTIMAL:
+        return False
+    shared = solution.backbone
+    return shared is not None and shared.proven and not shared.dstates.sometimes and not (shared.places and shared.places.sometimes)
 
 
 def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
@@ -169,6 +178,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--folder", type=Path, default=ROOT.parent / "shared" / "data" / "plans", metavar="FOLDER", help="of the plans")
     parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)")
     parser.add_argument("--stars", action="store_true", help="the solver is told of stars, too")
+    parser.add_argument("--causal", action="store_true", help="the causal theory: dstates alone have to be true")
     for name in ("displacement", "boundary", "prefer"):
         parser.add_argument(f"--{name}", metavar="CHOICE", help=f"of the theory's field {name}")
     for name in NUMBERS:
@@ -200,7 +210,10 @@ def chosen(options: argparse.Namespace) -> Iterator[Known]:
 def main() -> None:
     options = arguments().parse_args()
     choices = {name: value for name in ("displacement", "boundary", "prefer") if (value := getattr(options, name))}
-    theory = Theory.topological().replace(**choices, **({} if options.stars else {"star": "none"}))
+    if options.causal:
+        theory = Theory.causal().replace(**choices)
+    else:
+        theory = Theory.topological().replace(**choices, **({} if options.stars else {"star": "none"}))
     print(f"\n{report(chosen(options), theory, options.limit)}")
 
 

@@ -5,7 +5,7 @@
 >>> square = [(10, 0, 0), (0, 0, -1.5708)] * 4
 >>> trace = Trace.from_steps("ab" * 4 + "a", ["travel", "right"] * 4, displacements=square)
 >>> [(rung.name, rung.solution.cost.places, rung.solution.count) for rung in ladder(trace)]
-[('views', 3, 1), ('+ pairs', 4, 1), ('+ geometry', 4, 1)]
+[('views', 3, 1), ('+ pairs', 4, 1), ('+ geometry', 4, 1), ('+ planarity', 4, 1)]
 
 A square whose corners look alike is explained by a triangle, unless displacements say otherwise. Each rung is a theory of its own, and its maps are solved for from scratch.
 """

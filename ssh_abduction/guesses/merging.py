@@ -115,18 +115,21 @@ def thinned(chart: Chart, labels: Sequence[int], check: Callable[[], None] = lam
     dstates = numbered(labels)
     first = np.unique(dstates, return_index=True)[1]
     links = list(dict.fromkeys((dstates[t], action, dstates[u]) for t, action, u in chart.links))
-    classes = _Classes(_apart_in_map(np.asarray(chart.seen)[first], links, check), links, check, np.bincount(dstates))
+    excluded = [(dstates[i], dstates[j]) for i, j in chart.excluded]
+    classes = _Classes(_apart_in_map(np.asarray(chart.seen)[first], links, excluded, check), links, check, np.bincount(dstates))
     classes.known[:] = True
     classes.thin_all()
     return numbered(classes.root[dstates].tolist())
 
 
-def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link], check: Callable[[], None]) -> Matrix:
-    """Which pairs of dstates of a map are apart: those that show different views, or from which one action leads to dstates that are apart."""
+def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link], excluded: Sequence[tuple[int, int]], check: Callable[[], None]) -> Matrix:
+    """Which pairs of dstates of a map are apart: those that show different views, that evidence excludes, or from which one action leads to dstates that are apart."""
     leads: dict[int, NDArray[np.int_]] = {}
     for dstate, action, leads_to in links:
         leads.setdefault(action, np.full(len(seen), -1))[dstate] = leads_to
     apart: Matrix = seen[:, None] != seen
+    for s, x in excluded:
+        apart[s, x] = apart[x, s] = True
     while True:
         check()
         before = apart.copy()

@@ -33,7 +33,9 @@ Return: TypeAlias = tuple[int, int, int]  # two steps, and the degrees of freedo
 # What docs/theory.md says of one_pose: the errors of heading that are reckoned with, the uncertainty at which a heading is lost, the steps in which a drift is tried and how far.
 SIGMAS, LOST, BENDS_A_SIGMA, MOST_BENDS, ROUNDED = 6.0, 1.0, 2, 6, 1e-3
 # So many sets are worked on in one go.
-AT_A_TIME = 100_000
+AT_A_TIME = 50_000
+# Of a map with more sets of two returns so many are looked at, which takes a second or two.
+MOST_SETS = 300_000
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Refused:
 
 
 def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Refused]:
-    """The first return of a map that is refused, and the first set of two, if there are any.
+    """The return of a map that is refused most clearly, and the set of two, if there are any.
 
     trace   the whole trace
     theory  resolved, so that it says how many returns may be true
@@ -197,31 +199,40 @@ def _refused_alone(returns: Sequence[Return], drifts: Sequence[tuple[_Filter, fl
 
 
 def _refused_together(returns: Sequence[Return], drifts: Sequence[tuple[_Filter, float]], theory: Theory) -> Iterator[Refused]:
+    """The set of two that is refused most clearly. Of more than MOST_SETS sets, as many are looked at, evenly spread."""
     rows = np.array(sorted(returns), dtype=int).reshape(-1, 3)
-    for a in range(len(rows)):
-        for start in range(0, a, AT_A_TIME):
-            others = np.arange(start, min(a, start + AT_A_TIME))
-            overlap = np.maximum(rows[others, 0], rows[a, 0]) < np.minimum(rows[others, 1], rows[a, 1])
-            others = others[overlap]
-            least = np.full(len(others), np.inf)
-            most = np.array([_most(theory, int(f), together=True) for f in rows[others, 2] + rows[a, 2]])
-            for filtered, unlikely in drifts:
-                left = np.flatnonzero(least > most)
-                if not len(left):
-                    break
-                least[left] = np.minimum(least[left], _square_together(filtered, rows, a, others[left]) + unlikely)
-            refused = np.flatnonzero(least > most)
-            if len(refused):
-                worst = int(refused[np.argmax(least[refused] - most[refused])])
-                pair = returns_row(rows[others[worst]]), returns_row(rows[a])
-                yield Refused(pair, float(least[worst]), float(most[worst]))
-                return
+    thresholds = {freedom: _most(theory, freedom, together=True) for freedom in (4, 5, 6)}
+    worst: Refused | None = None
+    for first, second in _sets(rows):
+        least = np.full(len(first), np.inf)
+        most = np.array([thresholds[f] for f in (rows[first, 2] + rows[second, 2]).tolist()])
+        for filtered, unlikely in drifts:
+            left = np.flatnonzero(least > most)
+            if not len(left):
+                break
+            least[left] = np.minimum(least[left], _square_together(filtered, rows, first[left], second[left]) + unlikely)
+        excess = least - most
+        if len(excess) and excess.max() > (worst.square - worst.most if worst else 0.0):
+            k = int(excess.argmax())
+            worst = Refused((returns_row(rows[first[k]]), returns_row(rows[second[k]])), float(least[k]), float(most[k]))
+    if worst:
+        yield worst
 
 
-def _square_together(filtered: _Filter, rows: NDArray[np.int_], a: int, others: NDArray[np.int_]) -> Array:
-    """The chi-square of row `a` together with each other row; 0 where nothing is known of one of the two."""
-    m, here = len(others), np.full(len(others), a)
-    begin, end = np.maximum(rows[others, 0], rows[a, 0]), np.minimum(rows[others, 1], rows[a, 1])
+def _sets(rows: NDArray[np.int_]) -> Iterator[tuple[NDArray[np.int_], NDArray[np.int_]]]:
+    """The sets of two rows whose loops share displacements, in portions."""
+    later = [np.flatnonzero(rows[:a, 1] > rows[a, 0]) for a in range(len(rows))]  # rows are in order of their first steps
+    every = max(1, math.ceil(sum(map(len, later)) / MOST_SETS))
+    first = np.concatenate([np.zeros(0, dtype=int), *(others[a % every :: every] for a, others in enumerate(later))])
+    second = np.concatenate([np.zeros(0, dtype=int), *(np.full(len(others[a % every :: every]), a) for a, others in enumerate(later))])
+    for start in range(0, len(first), AT_A_TIME):
+        yield first[start : start + AT_A_TIME], second[start : start + AT_A_TIME]
+
+
+def _square_together(filtered: _Filter, rows: NDArray[np.int_], here: NDArray[np.int_], others: NDArray[np.int_]) -> Array:
+    """The chi-square of rows together with other rows; 0 where nothing is known of one of the two."""
+    m = len(others)
+    begin, end = np.maximum(rows[others, 0], rows[here, 0]), np.minimum(rows[others, 1], rows[here, 1])
     common = filtered.since(begin, end)
     mixed = filtered.onward(end, rows[here, 1]) @ common @ filtered.onward(end, rows[others, 1]).swapaxes(1, 2)
     mixed += filtered.repeated_since(rows[here, 0], rows[here, 1]) @ filtered.repeated_since(rows[others, 0], rows[others, 1]).swapaxes(
