@@ -1,10 +1,14 @@
 """How long a robot waits for its map at each step: a walk that explores a 10 x 10 maze with stars.
 
-    python benchmarks/online.py [--steps 1000] [--limit 0.5] [--size 10] [--seed 0] [--drive 0.05]
+    python benchmarks/online.py [--steps 1000] [--limit 0.5] [--size 10] [--seed 0] [--drive 0.05] [--odometry tight|usual]
 
 Optimal are the steps at which the answer was proven minimal; at the others it was a consistent map and a lower bound. `visited` are the
 dstates of the world that the robot has been in. Between two steps the robot drives for so many seconds, as no robot is faster, which is the
-time in which maps are guessed. At the checkpoints the trace is solved anew, in at most ANEW seconds.
+time in which maps are guessed. At the checkpoints the trace is solved anew, in at most ANEW seconds (`--anew 0` does not).
+
+With `--odometry` each action has a displacement; cells are 10 m apart. `tight` is 5 % along the way, 0.5 % across it and 0.002 rad a metre, and nothing that
+repeats, as in benchmarks/truth.py; `usual` is what odometry is worth where a trace does not say. `true` is the share of steps at which the first map has the
+true labels.
 """
 
 from __future__ import annotations
@@ -14,10 +18,14 @@ import time
 
 from instances import maze
 
-from ssh_abduction import OnlineMapper, Status, solve
+from ssh_abduction import Odometry, OnlineMapper, Status, solve
 
 CHECKPOINTS = (10, 20, 30, 40, 60, 100, 300, 1000, 4000)
 ANEW = 20.0  # seconds
+NOISE = {
+    "tight": Odometry(along=0.05, across=0.005, heading=0.002, turning=0.0, position=0.0, angle=0.0, scale=0.0, bend=0.0),
+    "usual": Odometry(),
+}
 
 
 def percentile(seconds: list[float], share: float) -> float:
@@ -31,13 +39,18 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=0.5)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=float, default=0.05)
+    parser.add_argument("--odometry", choices=NOISE)
+    parser.add_argument("--anew", type=float, default=ANEW)
     options = parser.parse_args()
-    walk = maze(options.size, options.size, steps=options.steps, seed=options.seed, stars=True)
+    odometry = NOISE.get(options.odometry)
+    walk = maze(options.size, options.size, steps=options.steps, seed=options.seed, stars=True, odometry=odometry)
     trace = walk.trace
     first, *rest = trace.steps
-    mapper = OnlineMapper(first.view or "", star=first.star, limit=options.limit)
+    mapper = OnlineMapper(first.view or "", star=first.star, odometry=odometry, limit=options.limit)
+    number: dict[object, int] = {}
+    truth = tuple(number.setdefault(state, len(number)) for state in walk.truth)
     seconds: list[float] = []
-    optimal = complete = 0
+    optimal = complete = true = 0
     sizes: list[float] = []
     print(
         f"{'steps':>6} {'status':10} {'dstates':>8} {'bound':>6} {'visited':>8} {'maps':>5} {'step, ms':>9} {'so far, s':>10} {'anew, s':>8} {'ratio':>7}"
@@ -45,14 +58,15 @@ def main() -> None:
     for action, step in zip(trace.actions, rest, strict=True):
         time.sleep(options.drive)
         began = time.perf_counter()
-        solution = mapper.observe(action, step.view or "", star=step.star)
+        solution = mapper.observe(action, step.view or "", star=step.star, displacement=step.displacement)
         seconds.append(time.perf_counter() - began)
         optimal += solution.status is Status.OPTIMAL
         complete += solution.complete
+        true += bool(solution.maps) and solution.maps[0].labels == truth[: solution.steps]
         visited = len(set(walk.truth[: solution.steps]))
         sizes.append(solution.cost.dstates / visited if solution.cost else 0.0)
         if solution.steps in CHECKPOINTS:
-            anew = solve(trace.prefix(solution.steps), limit=ANEW).seconds.total
+            anew = solve(trace.prefix(solution.steps), limit=options.anew).seconds.total if options.anew else 0.0
             dstates = solution.cost.dstates if solution.cost else 0
             print(
                 f"{solution.steps:6} {solution.status.value:10} {dstates:8} {solution.bound.dstates or 0:6} {visited:8} {solution.count:5} "
@@ -62,7 +76,7 @@ def main() -> None:
     print(
         f"{len(seconds)} steps, {mapper.searches} searches: median {1000 * percentile(seconds, 0.5):.2f} ms, "
         f"99th percentile {1000 * percentile(seconds, 0.99):.0f} ms, most {1000 * max(seconds):.0f} ms; "
-        f"optimal {optimal / len(seconds):.1%}, all minimal maps {complete / len(seconds):.1%}; "
+        f"optimal {optimal / len(seconds):.1%}, all minimal maps {complete / len(seconds):.1%}, true {true / len(seconds):.1%}; "
         f"dstates by visited: median {percentile(sizes, 0.5):.2f}, most {max(sizes):.2f}"
     )
 

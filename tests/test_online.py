@@ -376,7 +376,7 @@ def test_the_trace_settles_displacements_as_it_grows(theory: Theory, stars: bool
     assert [answer.theory.displacement for answer in answers[:6]] == ["none"] * 4 + ["use"] * 2
     assert answers[3].theory.prefer[-1] == ("dstates" if theory.level == "causal" else "places")
     assert answers[4].theory.prefer[-1] == ("dstates" if theory.level == "causal" else "paths")
-    assert len({answer.theory.returns for answer in answers}) > 4
+    assert len({answer.theory.returns for answer in answers}) > 2
 
 
 def test_displacements_may_be_asked_for_before_the_first_one_comes() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from instances import maze
 from strategies import traces
 
 from ssh_abduction import DState, Odometry, SSHMap, Theory, Trace
+from ssh_abduction.judge import geometry
+from ssh_abduction.judge.geometry import refused_returns
 from ssh_abduction.theory.evidence import displacement as module
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns
 from ssh_abduction.theory.loops import Loops, Reckoning, chi_squares
@@ -126,3 +129,20 @@ def test_only_returns_that_end_later_are_asked_about_once_a_map_was_accepted() -
         assert grown == Returns(evidence, prefix).refused_together(ssh_map)
         assert (grown is None) == (n <= size)
     assert size > 10
+
+
+@pytest.mark.parametrize("noise", ["usual", "white"])
+def test_bounds_change_nothing_that_the_judge_says(noise: str) -> None:
+    """With shares so large that true maps are refused, too: the judge says the same of all sets as of those that its bound does not pass."""
+    said = []
+    for seed in range(4):
+        model = replace(Odometry(along=0.02), **({"bend": 0.0, "scale": 0.0} if noise == "white" else {}))
+        walk = maze(3, 3, steps=30, seed=seed, odometry=model)
+        theory = Theory(displacement="use", returns=3, reject=0.97, star="none")
+        for dstates in (1000, 9):
+            ssh_map = seen(walk.trace, walk.truth, dstates)
+            bounded = list(refused_returns(walk.trace, ssh_map, theory))
+            with patch.object(geometry, "_is_safe", lambda share, squares, most: np.zeros_like(squares, dtype=bool)):
+                assert list(refused_returns(walk.trace, ssh_map, theory)) == bounded
+            said += [len(refused.returns) for refused in bounded]
+    assert said.count(2) > 4

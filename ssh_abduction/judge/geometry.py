@@ -8,6 +8,10 @@ first step, and V(t) its covariance. What was wrong at step i is wrong at a late
 So the loop from i to j closes with the error E(j) - F(j, i) E(i). Its covariance is V(j) - F(j, i) V(i) F(j, i)', as what is new at each step is independent of what
 was before; and two loops have in common what was new between the later of their beginnings b and the earlier of their ends e. A scale that is wrong and a
 heading that drifts are carried along as two more errors, which never change.
+
+Most sets of two are passed by a bound. Let z and y be the chi-squares of two returns alone. If what both have in common is a share s of what there is of the first
+one, in any direction, at most, then together they have a chi-square of (z + y) / (1 - sqrt(s)) at most. The trace of the share is a bound on it, and is the difference
+of two values of a table; so is the share itself, and the square root of the trace of its square is another bound.
 """
 
 from __future__ import annotations
@@ -28,14 +32,17 @@ from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
 Array: TypeAlias = NDArray[np.float64]
+Steps: TypeAlias = NDArray[np.int_]
 Return: TypeAlias = tuple[int, int, int]  # two steps, and the degrees of freedom: 2 at one place, 3 at one dstate
 
 # What docs/theory.md says of one_pose: the errors of heading that are reckoned with, the uncertainty at which a heading is lost, the steps in which a drift is tried and how far.
 SIGMAS, LOST, BENDS_A_SIGMA, MOST_BENDS, ROUNDED = 6.0, 1.0, 2, 6, 1e-3
 # So many sets are worked on in one go.
 AT_A_TIME = 50_000
-# Of a map with more sets of two returns so many are looked at, which takes a second or two.
+# Of a map with more sets of two returns that the bound does not pass so many are looked at, which takes a second or two.
 MOST_SETS = 300_000
+# A bound passes a set only if it is this far from not doing so, as numbers are rounded.
+MARGIN = 1e-3
 
 
 @dataclass(frozen=True)
@@ -55,10 +62,10 @@ def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[R
     """
     if not trace.has_displacements:
         return
-    drifts = list(_drifts(trace))
-    yield from _refused_alone(list(_returns(trace, ssh_map, theory, drifts[0][0])), drifts, theory)
+    drifts = _Drifts(trace)
+    yield from _refused_alone(list(_returns(trace, ssh_map, theory, drifts.none)), drifts, theory)
     if theory.joint > 1:
-        yield from _refused_together(list(_returns(trace, ssh_map, theory, drifts[0][0], of_arrivals=True)), drifts, theory)
+        yield from _refused_together(list(_returns(trace, ssh_map, theory, drifts.none, of_arrivals=True)), drifts, theory)
 
 
 class _Filter:
@@ -98,6 +105,13 @@ class _Filter:
         """The covariance, by noise alone, of what went wrong between two steps."""
         onward = self.onward(first, last)
         covariance: Array = self.white[last] - onward @ self.white[first] @ onward.swapaxes(-1, -2)
+        return covariance
+
+    def new_until(self, end: int) -> Array:
+        """The covariance, by noise alone, that what went wrong up to each step has at step `end`, m x 9."""
+        steps = np.arange(end + 1)
+        onward = self.onward(steps, np.full(end + 1, end))
+        covariance: Array = (onward @ self.white[: end + 1] @ onward.swapaxes(-1, -2)).reshape(-1, 9)
         return covariance
 
     def repeated_since(self, first: Any, last: Any) -> Array:
@@ -149,13 +163,24 @@ def _onward(moved: Array) -> Array:
     return onward
 
 
-def _drifts(trace: Trace) -> Iterator[tuple[_Filter, float]]:
-    """The poses for each drift of the heading, and the chi-square of that drift, no drift first."""
-    odometry = trace.odometry or Odometry()
-    numbers = range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1) if odometry.bend else [0]
-    step = odometry.bend / BENDS_A_SIGMA
-    for n in sorted(numbers, key=lambda n: (abs(n), n)):
-        yield _Filter(trace, odometry, n * step, step / 2), max(abs(n) - 0.5, 0.0) ** 2 / BENDS_A_SIGMA**2
+class _Drifts:
+    """The poses for each drift of the heading, and the chi-square of that drift, no drift first. Each is made when it is first asked for."""
+
+    def __init__(self, trace: Trace) -> None:
+        self._trace, self._odometry = trace, trace.odometry or Odometry()
+        self._made: dict[int, _Filter] = {}
+        self.none = self._filter(0)
+
+    def _filter(self, number: int) -> _Filter:
+        step = self._odometry.bend / BENDS_A_SIGMA
+        if number not in self._made:
+            self._made[number] = _Filter(self._trace, self._odometry, number * step, step / 2)
+        return self._made[number]
+
+    def __iter__(self) -> Iterator[tuple[_Filter, float]]:
+        numbers = range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1) if self._odometry.bend else [0]
+        for n in sorted(numbers, key=lambda n: (abs(n), n)):
+            yield self._filter(n), max(abs(n) - 0.5, 0.0) ** 2 / BENDS_A_SIGMA**2
 
 
 def _returns(trace: Trace, ssh_map: SSHMap, theory: Theory, known: _Filter, of_arrivals: bool = False) -> Iterator[Return]:
@@ -185,25 +210,28 @@ def _most(theory: Theory, freedom: int, together: bool) -> float:
     return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
 
-def _refused_alone(returns: Sequence[Return], drifts: Sequence[tuple[_Filter, float]], theory: Theory) -> Iterator[Refused]:
+def _refused_alone(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -> Iterator[Refused]:
     for freedom in (2, 3):
         rows = np.array([r for r in returns if r[2] == freedom], dtype=int).reshape(-1, 3)
         most, least = _most(theory, freedom, together=False), np.full(len(rows), np.inf)
         for filtered, unlikely in drifts:
-            first, last = rows[:, 0], rows[:, 1]
+            left = np.flatnonzero(least > most)
+            if not len(left):
+                break
+            first, last = rows[left, 0], rows[left, 1]
             square = _square(filtered.closing(first, last)[:, :freedom], filtered.covariance(first, last)[:, :freedom, :freedom])
-            least = np.minimum(least, np.where(filtered.is_known(first, last), square + unlikely, 0.0))
+            least[left] = np.minimum(least[left], np.where(filtered.is_known(first, last), square + unlikely, 0.0))
         if len(rows) and least.max() > most:
             worst = int(least.argmax())
             yield Refused((returns_row(rows[worst]),), float(least[worst]), most)
 
 
-def _refused_together(returns: Sequence[Return], drifts: Sequence[tuple[_Filter, float]], theory: Theory) -> Iterator[Refused]:
-    """The set of two that is refused most clearly. Of more than MOST_SETS sets, as many are looked at, evenly spread."""
-    rows = np.array(sorted(returns), dtype=int).reshape(-1, 3)
+def _refused_together(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -> Iterator[Refused]:
+    """The set of two that is refused most clearly. Of more than MOST_SETS sets that the bound does not pass, as many are looked at, evenly spread."""
+    rows = np.array(sorted(returns, key=lambda r: r[1]), dtype=int).reshape(-1, 3)
     thresholds = {freedom: _most(theory, freedom, together=True) for freedom in (4, 5, 6)}
     worst: Refused | None = None
-    for first, second in _sets(rows):
+    for first, second in _sets(rows, drifts.none, min(thresholds.values())):
         least = np.full(len(first), np.inf)
         most = np.array([thresholds[f] for f in (rows[first, 2] + rows[second, 2]).tolist()])
         for filtered, unlikely in drifts:
@@ -219,17 +247,63 @@ def _refused_together(returns: Sequence[Return], drifts: Sequence[tuple[_Filter,
         yield worst
 
 
-def _sets(rows: NDArray[np.int_]) -> Iterator[tuple[NDArray[np.int_], NDArray[np.int_]]]:
-    """The sets of two rows whose loops share displacements, in portions."""
-    later = [np.flatnonzero(rows[:a, 1] > rows[a, 0]) for a in range(len(rows))]  # rows are in order of their first steps
-    every = max(1, math.ceil(sum(map(len, later)) / MOST_SETS))
-    first = np.concatenate([np.zeros(0, dtype=int), *(others[a % every :: every] for a, others in enumerate(later))])
-    second = np.concatenate([np.zeros(0, dtype=int), *(np.full(len(others[a % every :: every]), a) for a, others in enumerate(later))])
-    for start in range(0, len(first), AT_A_TIME):
-        yield first[start : start + AT_A_TIME], second[start : start + AT_A_TIME]
+def _sets(rows: Steps, filtered: _Filter, most: float) -> Iterator[tuple[Steps, Steps]]:
+    """The sets of two rows whose loops share displacements and that the bound does not pass, in portions.
+
+    rows  by last step
+    most  the least chi-square at which a set may be refused
+    """
+    alone = _Alone(filtered, rows)
+    found = [_unsafe(filtered, rows, alone, int(end), most) for end in np.unique(rows[:, 1])]
+    empty = np.zeros(0, dtype=int)
+    first, second = (np.concatenate([empty, *(pair[k] for pair in found)]) for k in (0, 1))
+    every = max(1, math.ceil(len(first) / MOST_SETS))
+    for start in range(0, len(first), every * AT_A_TIME):
+        portion = slice(start, start + every * AT_A_TIME, every)
+        yield first[portion], second[portion]
 
 
-def _square_together(filtered: _Filter, rows: NDArray[np.int_], here: NDArray[np.int_], others: NDArray[np.int_]) -> Array:
+class _Alone:
+    """Of each row alone: the inverse of its covariance (m x 9), its chi-square, and what errors that repeat contribute to the covariance (m x 9)."""
+
+    def __init__(self, filtered: _Filter, rows: Steps) -> None:
+        first, last = rows[:, 0], rows[:, 1]
+        places = rows[:, 2] == 2
+        off, covariance, repeated = filtered.closing(first, last), filtered.covariance(first, last), filtered.repeated_since(first, last)
+        covariance[places, 2, :] = covariance[places, :, 2] = 0.0
+        covariance[places, 2, 2] = 1.0
+        inverse = np.linalg.inv(covariance)
+        inverse[places, 2, 2] = 0.0  # the heading of a return to a place is not asked for
+        self.square = np.einsum("mi,mij,mj->m", off, inverse, off)
+        self.inverse, self.repeated = inverse.reshape(-1, 9), (repeated @ repeated.swapaxes(1, 2)).reshape(-1, 9)
+
+
+def _unsafe(filtered: _Filter, rows: Steps, alone: _Alone, end: int, most: float) -> tuple[Steps, Steps]:
+    """The sets of a row that ends at a step and another one that ends no later, if the bound does not pass them."""
+    later = np.arange(*np.searchsorted(rows[:, 1], [end, end + 1]))
+    earlier = np.arange(np.searchsorted(rows[:, 1], rows[later, 0].min(), side="right"), later[-1] + 1)
+    first, stop = rows[later, 0], rows[earlier, 1, None]
+    new = filtered.new_until(end)
+    table = new @ alone.inverse[later].T
+    begin = np.maximum(rows[earlier, 0, None], first)
+    trace = table[rows[earlier, 1]] - np.take_along_axis(table, begin, axis=0) + (alone.inverse[later] * alone.repeated[later]).sum(1)
+    squares = alone.square[earlier, None] + alone.square[later]
+    others, these = np.nonzero(~_is_safe(trace, squares, most) & (stop > first) & (earlier[:, None] < later))
+    share = new[rows[earlier[others], 1]] - new[begin[others, these]] + alone.repeated[later[these]]
+    share = alone.inverse[later[these]].reshape(-1, 3, 3) @ share.reshape(-1, 3, 3)
+    norm = np.sqrt(np.maximum(np.einsum("mij,mji->m", share, share), 0.0))
+    left = ~_is_safe(norm, squares[others, these], most)
+    return earlier[others[left]], later[these[left]]
+
+
+def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
+    """Whether sets are not refused, by a bound on the share that both rows have in common, and the sum of their chi-squares."""
+    left = 1 - squares / most
+    safe: NDArray[np.bool_] = (left > 0) & (share + MARGIN <= left**2)
+    return safe
+
+
+def _square_together(filtered: _Filter, rows: Steps, here: Steps, others: Steps) -> Array:
     """The chi-square of rows together with other rows; 0 where nothing is known of one of the two."""
     m = len(others)
     begin, end = np.maximum(rows[others, 0], rows[here, 0]), np.minimum(rows[others, 1], rows[here, 1])
@@ -259,7 +333,7 @@ def _square(off: Array, covariance: Array) -> Array:
     return square
 
 
-def returns_row(row: NDArray[np.int_]) -> Return:
+def returns_row(row: Steps) -> Return:
     """A return from its row."""
     first, last, freedom = map(int, row)
     return first, last, freedom
