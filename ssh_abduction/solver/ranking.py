@@ -14,8 +14,8 @@ from ssh_abduction.trace import Trace
 RANKED = 1000
 # The noise of the odometry is said to be wrong where a chi-square like that of the best map is as unlikely as this, in either direction,
 DOUBTED = 1e-3
-# and the standard deviations are wrong by this factor at least: less changes no answer.
-OFF = 1.5
+# and the standard deviations are too small by this factor at least, or too large by that one: less changes no answer, and too large ones only exclude less.
+TOO_SMALL, TOO_LARGE = 1.5, 2.0
 # Displacements that agree to the last digit would make it 0.
 NEVER_LESS = 0.01
 
@@ -67,7 +67,7 @@ def noise_warning(fit: Fit | None) -> str | None:
     if fit is None or fit.dof < 1 or min(fit.p, 1 - fit.p) > DOUBTED / 2:
         return None
     factor = max(math.sqrt(fit.chi2 / fit.dof), NEVER_LESS)
-    if 1 / OFF < factor < OFF:
+    if 1 / TOO_LARGE < factor < TOO_SMALL:
         return None
     how, told = ("smaller", "tight") if factor > 1 else ("larger", "loose")
     return (
