@@ -69,7 +69,7 @@ def test_two_returns_that_cannot_both_be() -> None:
 
 def test_explanations_are_smallest_where_returns_are_refused_together() -> None:
     """One return is asserted, and the axioms make it the other one, too: the explanation names both axioms, and not one that is not needed."""
-    trace, theory = uneven(), Theory(same=[(1, 9)])
+    trace, theory = uneven(), Theory.causal().replace(same=[(1, 9)])
     explanation = explain(trace, theory)
     assert explanation
     assert set(explanation.axioms) == {"deterministic", "asserted", "one_pose"}
@@ -78,6 +78,19 @@ def test_explanations_are_smallest_where_returns_are_refused_together() -> None:
     for axiom in ("deterministic", "one_pose"):
         left = theory.replace(without=(axiom,)) if axiom != "one_pose" else theory.replace(displacement="none")
         assert explain(trace.prefix(12), left) is None
+
+
+def test_streets_that_would_cross_are_named() -> None:
+    """A street that is travelled back and forth leads back to where it began, or it could not be drawn. That is found out of maps alone, and the explanation names it."""
+    trace = Trace.from_steps("aaaaa", ["travel", "around", "travel", "around"])
+    drawn, crossed = Theory(planar=True, same=[(0, 4)]), Theory(planar=True, different=[(0, 4)], elsewhere=[(0, 3)])
+    assert solve(trace, drawn).status is Status.OPTIMAL
+    assert explain(trace, drawn) is None
+    assert solve(trace, crossed).status is Status.UNSATISFIABLE
+    explanation = explain(trace, crossed)
+    assert explanation
+    assert {"asserted", "planar"} <= set(explanation.axioms)
+    assert explanation.sentences == ()
 
 
 def test_distances_are_those_of_dead_reckoning() -> None:
