@@ -10,14 +10,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeAlias
 
 import clingo
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.rules import check_rules
+from ssh_abduction.errors import TraceError, brief, is_whole
+from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory import encodings
+from ssh_abduction.theory.evidence import Displacement, Equality, evidence_of
 from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Trace, checked_trace
 
@@ -25,6 +29,10 @@ from ssh_abduction.trace import Trace, checked_trace
 POLL = 0.05
 # Steps that are grounded between two such questions: eight take a moment, and more calls would take longer.
 AT_A_TIME = 8
+# So many refused returns that end at one step are told of, at most.
+MOST_SENTENCES = 3
+
+Refusal: TypeAlias = frozenset[Equality]  # what cannot all hold
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +45,16 @@ class Clash:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Steps `first` to `last` alone have no map. If any one clash is dropped, even at one of its steps only, they have one."""
+    """Steps `first` to `last` alone have no map. If any one clash is dropped, even at one of its steps only, they have one.
+
+    sentences  what displacements say where they clash (`one_pose`): for each of these steps, at most three of the returns that end there, cannot be, and take part in
+               the clash, the clearest first
+    """
 
     first: int
     last: int
     clashes: tuple[Clash, ...]
+    sentences: tuple[str, ...] = ()
 
     @property
     def axioms(self) -> tuple[str, ...]:
@@ -53,7 +66,12 @@ class Explanation:
         return f"no map satisfies the axioms: in steps {self.first} to {self.last} these clash: {', '.join(parts)}"
 
     def to_dict(self) -> dict[str, object]:
-        return {"first": self.first, "last": self.last, "clashes": [{"axiom": c.axiom, "steps": list(c.steps)} for c in self.clashes]}
+        return {
+            "first": self.first,
+            "last": self.last,
+            "clashes": [{"axiom": c.axiom, "steps": list(c.steps)} for c in self.clashes],
+            "sentences": list(self.sentences),
+        }
 
 
 class Interrupted(Exception):  # noqa: N818 - not an error
@@ -78,11 +96,33 @@ def explain(trace: Trace, theory: Theory | None = None, stop: Callable[[], bool]
     length = _shortest(length, lambda n: not _Axioms(trace, theory, stop, last + 1 - n, n).consistent()) or length
     first = last + 1 - length
     clashes: dict[str, list[int]] = {}
-    for axiom, step in _Axioms(trace, theory, stop, first, length, relaxed=True).smallest_clash():
+    axioms = _Axioms(trace, theory, stop, first, length, relaxed=True)
+    clash = axioms.smallest_clash()
+    for axiom, step in clash:
         clashes.setdefault(axiom, []).append(first + step)
     order = theory.axioms
     found = tuple(Clash(name, tuple(sorted(clashes[name]))) for name in sorted(clashes, key=order.index))
-    return Explanation(first, last, found)
+    return Explanation(first, last, found, axioms.sentences(clash))
+
+
+def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = None) -> str | None:
+    """Why displacements keep two steps from being at one place, or one dstate, in a sentence; None where they do not.
+
+    Raises TraceError for a step that the trace does not have, or for one step twice.
+    """
+    theory = checked_theory(theory).resolve(checked_trace(trace))
+    for step in (first, second):
+        if not is_whole(step) or not 0 <= step < len(trace):
+            raise TraceError(f"step: expected a step from 0 to {len(trace) - 1}, got {brief(step)}; steps are counted from 0")
+    if first == second:
+        raise TraceError(f"step: expected two steps, got {first} twice; take another one")
+    displacement = _displacement(theory)
+    return displacement.returns_of(trace).why_apart(min(first, second), max(first, second)) if displacement else None
+
+
+def _displacement(theory: Theory) -> Displacement | None:
+    """What displacements say, where they take part in a theory."""
+    return next((evidence for evidence in evidence_of(theory) if isinstance(evidence, Displacement)), None)
 
 
 def _stretch(trace: Trace, first: int, length: int) -> Trace:
@@ -104,14 +144,33 @@ def _shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:
     return long
 
 
+class _Answer(NamedTuple):
+    """What an answer of clingo says: the dstate and the place of each step, and a map of them, which is one only if no axiom is broken."""
+
+    labels: tuple[int, ...]
+    places: tuple[int | None, ...]
+    ssh_map: SSHMap
+
+    def has(self, equalities: Collection[Equality]) -> bool:
+        """Whether all these equalities hold."""
+        named = {"dstate": self.labels, "place": self.places}
+        return all((named[e.of][e.first] == named[e.of][e.second]) == e.holds for e in equalities)
+
+
 class _Axioms:
-    """The axioms of some steps of a trace, in clingo, as if these steps were all of it. Where `relaxed`, each axiom can be switched on or off at each step."""
+    """The axioms of some steps of a trace, in clingo, as if these steps were all of it. Where `relaxed`, each axiom can be switched on or off at each step.
+
+    What evidence finds out only once there is a map, clingo is told of then, and asked again.
+    """
 
     def __init__(self, trace: Trace, theory: Theory, stop: Callable[[], bool], first: int, length: int, *, relaxed: bool = False) -> None:
         trace, theory = _stretch(trace, first, length), theory.of_steps(first, length)
+        self._trace, self._theory, self._first = trace, theory, first
+        self._evidence = evidence_of(theory)
         self._stop = stop
+        self._told = 0  # rules that were added since
         self._control = clingo.Control(["--warn=none"])
-        names = [name for name in facts.encoding_names(theory) if name not in ("preference", "show")]
+        names = [name for name in facts.encoding_names(theory) if name != "preference"]
         for name in [*names, "explain"] if relaxed else names:
             self._control.load(encodings.path(name))
         last = len(trace) - 1
@@ -133,12 +192,82 @@ class _Axioms:
 
     def consistent(self, active: Sequence[clingo.Symbol] = ()) -> bool:
         """Whether there is a map. Where the axioms are relaxed, only the active ones have to hold."""
-        with self._control.solve(assumptions=[(symbol, True) for symbol in active], async_=True) as handle:
+        while answer := self._answer(active):
+            refused = self._refused(answer, {self._pairs[symbol] for symbol in active})
+            if refused is None:
+                return True
+            axiom, refusal = refused
+            self._forbid(refusal, facts.active(axiom, _last_step(refusal)) if self._pairs else None)
+        return False
+
+    def _answer(self, active: Sequence[clingo.Symbol]) -> _Answer | None:
+        """An answer of clingo in which these axioms hold."""
+        found: list[_Answer] = []
+
+        def keep(model: clingo.Model) -> None:
+            found.append(_Answer(*facts.read_steps(model), facts.read_map(model, self._trace, self._theory)))
+
+        with self._control.solve(assumptions=[(symbol, True) for symbol in active], on_model=keep, async_=True) as handle:
             while not handle.wait(POLL):
                 if self._stop():
                     handle.cancel()
                     raise Interrupted
-            return bool(handle.get().satisfiable)
+            return found[0] if handle.get().satisfiable else None
+
+    def _refused(self, answer: _Answer, active: Collection[tuple[str, int]]) -> tuple[str, Refusal] | None:
+        """What some evidence finds out cannot all hold in an answer, and its axiom. Where the axioms are relaxed, that has to be active at the last of the steps."""
+        for evidence in self._evidence:
+            if not self._pairs:
+                found = [evidence.refuse(self._trace, answer.ssh_map)]
+            elif isinstance(evidence, Displacement):
+                found = [self._refused_together(evidence, answer, t) for axiom, t in sorted(active) if axiom == evidence.axiom]
+            else:
+                found = [evidence.refuse(self._trace, answer.ssh_map)] if any(axiom == evidence.axiom for axiom, _ in active) else []
+            for refusal in filter(None, found):
+                if not self._pairs or (answer.has(refusal) and (evidence.axiom, _last_step(refusal)) in active):
+                    return evidence.axiom, refusal
+        return None
+
+    def _refused_together(self, displacement: Displacement, answer: _Answer, step: int) -> Refusal | None:
+        """Two returns of an answer that are refused together, the later of which ends at a step."""
+        if displacement.joint == 1:
+            return None
+        return displacement.returns_of(self._trace).refused_at(answer.labels, answer.places, step)
+
+    def _forbid(self, refusal: Refusal, where: clingo.Symbol | None = None) -> None:
+        """Tell clingo that not all of these equalities hold; where an atom is given, only if that holds."""
+        name = f"told_{self._told}"
+        self._told += 1
+        self._control.add(name, [], facts.forbidden_equalities(refusal, where))
+        self._control.ground([(name, [])])
+
+    def sentences(self, clash: Sequence[tuple[str, int]]) -> tuple[str, ...]:
+        """What displacements say of the returns that take part in a clash, as in Explanation.
+
+        The other clashes leave answers, in each of which some return is refused. The clearest of them is forbidden, until there is no answer left.
+        """
+        displacement = _displacement(self._theory)
+        steps = [t for axiom, t in clash if displacement and axiom == displacement.axiom]
+        if not displacement or not steps:
+            return ()
+        returns = displacement.returns_of(self._trace)
+        said: dict[int, list[tuple[float, str]]] = {t: [] for t in steps}
+        others = [symbol for symbol, pair in self._pairs.items() if pair in clash and pair[0] != displacement.axiom]
+        while answer := self._answer(others):
+            alone = [e for t in steps for e in returns.refused_alone_at(answer.labels, answer.places, t)]
+            if alone:
+                clearest = max(alone, key=returns.excess)
+                refusal: Refusal | None = frozenset([clearest])
+                found = returns.excess(clearest), returns.why_apart(clearest.first, clearest.second, self._first) or ""
+            else:
+                refusal = next(filter(None, (self._refused_together(displacement, answer, t) for t in steps)), None)
+                found = 0.0, returns.why_not_both(refusal or (), self._first)
+            if refusal is None:
+                break
+            said[_last_step(refusal)].append(found)
+            self._forbid(refusal)
+        clearest_first = (sorted(said[t], reverse=True)[:MOST_SENTENCES] for t in sorted(steps))
+        return tuple(dict.fromkeys(sentence for found in clearest_first for _, sentence in found))
 
     def smallest_clash(self) -> list[tuple[str, int]]:
         """Pairs of axiom and step that leave no map, while any proper subset of them leaves one.
@@ -161,3 +290,8 @@ class _Axioms:
             if not self.consistent(fewer):
                 kept = fewer
         return kept
+
+
+def _last_step(refusal: Refusal) -> int:
+    """The last of the steps that these equalities are about."""
+    return max(max(e.first, e.second) for e in refusal)

@@ -182,6 +182,16 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
     return _map(trace, is_at, place, course, heading, before, excused)
 
 
+def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
+    """The dstate and the place of each step in an answer set, which may break axioms; in a causal theory no step has a place."""
+    found: dict[str, dict[int, int]] = {"is": {}, "at": {}}
+    for name, args in map(_atom, model.symbols(shown=True)):
+        if name in found:
+            found[name][args[0]] = args[1]
+    steps = range(len(found["is"]))
+    return tuple(found["is"][t] for t in steps), tuple(found["at"].get(t) for t in steps)
+
+
 def _map(
     trace: Trace,
     is_at: Mapping[int, int],
@@ -407,9 +417,10 @@ def forbidden_places(equalities: Sequence[Sequence[tuple[int, int, int]]]) -> st
     return "\n".join(forbidden_pairs(pairs) for pairs in product(*equalities))
 
 
-def forbidden_equalities(equalities: Iterable[Equality]) -> str:
-    """The rule that these equalities of steps do not all hold."""
-    atoms = [
+def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = None) -> str:
+    """The rule that these equalities of steps do not all hold; where an atom is given, only if that holds."""
+    atoms = [str(where)] if where else []
+    atoms += [
         f"{'' if e.holds else 'not '}same{'' if e.of == 'dstate' else '_place'}({min(e.first, e.second)},{max(e.first, e.second)})"
         for e in equalities
     ]

@@ -169,6 +169,7 @@ def _lines(search: Search, solution: Solution, explanation: Explanation | None, 
     yield from by_displacements(solution)
     if solution.status is Status.UNSATISFIABLE:
         if explanation:
+            yield from explanation.sentences
             first, last = search.trace.at(explanation.first), search.trace.at(explanation.last)
             yield f"look at what was seen and done from {first} to {last}, or leave one of these axioms out: --without NAME"
         return

@@ -904,7 +904,7 @@ def _one_pose(m: _Reading) -> Found:
         steps = [t for i, j, _ in refused.returns for t in (i, j)]
         yield (
             steps,
-            f"By the displacements it cannot be that {said}: chi-square {refused.square:.0f}, and at most {refused.most:.0f} is allowed.",
+            f"By the displacements it cannot be that {said}: {refused} (chi-square {refused.square:.0f}, and at most {refused.most:.0f} is allowed).",
         )
 
 

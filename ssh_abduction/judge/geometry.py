@@ -34,6 +34,7 @@ from ssh_abduction.trace import Trace
 Array: TypeAlias = NDArray[np.float64]
 Steps: TypeAlias = NDArray[np.int_]
 Return: TypeAlias = tuple[int, int, int]  # two steps, and the degrees of freedom: 2 at one place, 3 at one dstate
+_Found: TypeAlias = tuple[tuple[Return, ...], float, float]  # returns that are refused, their chi-square and the threshold
 
 # What docs/theory.md says of one_pose: the errors of heading that are reckoned with, the uncertainty at which a heading is lost, the steps in which a drift is tried and how far.
 SIGMAS, LOST, BENDS_A_SIGMA, MOST_BENDS, ROUNDED = 6.0, 1.0, 2, 6, 1e-3
@@ -46,12 +47,37 @@ MARGIN = 1e-3
 
 
 @dataclass(frozen=True)
+class Closing:
+    """How far off a loop closes by dead reckoning, with standard deviations, in metres and degrees, and how many metres it is long."""
+
+    way: float
+    size: float
+    size_sigma: float
+    turned: float
+    turned_sigma: float
+
+
+@dataclass(frozen=True)
 class Refused:
-    """Returns of a map that are refused, alone or two together: their steps, and how likely so bad a closing is at most, as chi-square and threshold."""
+    """Returns of a map that are refused, alone or two together: their steps, how far off they close, and the chi-square of that and its threshold."""
 
     returns: tuple[Return, ...]
+    closings: tuple[Closing, ...]
     square: float
     most: float
+
+    def __str__(self) -> str:
+        """In words: how far apart the steps of one return are, or how far off the loops of two close."""
+        if len(self.closings) == 2:
+            ways, sizes = (" and ".join(f"{value:{form}} m" for value in values) for form, values in self._of_loops())
+            return f"the loops of {ways} close {sizes} off"
+        closing, (_, _, freedom) = self.closings[0], self.returns[0]
+        turned = f" and {closing.turned:.0f} ± {closing.turned_sigma:.0f} degrees" if freedom == 3 else ""
+        return f"they are {closing.size:.1f} ± {closing.size_sigma:.1f} m{turned} apart"
+
+    def _of_loops(self) -> Iterator[tuple[str, list[float]]]:
+        yield ".0f", [closing.way for closing in self.closings]
+        yield ".1f", [closing.size for closing in self.closings]
 
 
 def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Refused]:
@@ -63,9 +89,27 @@ def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[R
     if not trace.has_displacements:
         return
     drifts = _Drifts(trace)
-    yield from _refused_alone(list(_returns(trace, ssh_map, theory, drifts.none)), drifts, theory)
+    found = list(_refused_alone(list(_returns(trace, ssh_map, theory, drifts.none)), drifts, theory))
     if theory.joint > 1:
-        yield from _refused_together(list(_returns(trace, ssh_map, theory, drifts.none, of_arrivals=True)), drifts, theory)
+        found += _refused_together(list(_returns(trace, ssh_map, theory, drifts.none, of_arrivals=True)), drifts, theory)
+    for returns, square, most in found:
+        yield Refused(returns, tuple(_closing(trace, i, j) for i, j, _ in returns), square, most)
+
+
+def _closing(trace: Trace, first: int, last: int) -> Closing:
+    """How far off a loop closes if the heading drifts by nothing; that it may drift is part of the uncertainty."""
+    odometry = trace.odometry or Odometry()
+    filtered = _Filter(trace.prefix(last + 1), odometry, 0.0, odometry.bend)
+    off, covariance = filtered.closing(first, last), filtered.covariance(first, last)
+    size = float(np.hypot(*off[:2]))
+    ahead = off[:2] / size if size else np.array([1.0, 0.0])
+    return Closing(
+        way=math.fsum(math.hypot(*step.displacement[:2]) for step in trace.steps[first + 1 : last + 1] if step.displacement),
+        size=size,
+        size_sigma=math.sqrt(ahead @ covariance[:2, :2] @ ahead),
+        turned=math.degrees(abs(off[2])),
+        turned_sigma=math.degrees(math.sqrt(covariance[2, 2])),
+    )
 
 
 class _Filter:
@@ -210,7 +254,7 @@ def _most(theory: Theory, freedom: int, together: bool) -> float:
     return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
 
-def _refused_alone(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -> Iterator[Refused]:
+def _refused_alone(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -> Iterator[_Found]:
     for freedom in (2, 3):
         rows = np.array([r for r in returns if r[2] == freedom], dtype=int).reshape(-1, 3)
         most, least = _most(theory, freedom, together=False), np.full(len(rows), np.inf)
@@ -223,14 +267,14 @@ def _refused_alone(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -
             least[left] = np.minimum(least[left], np.where(filtered.is_known(first, last), square + unlikely, 0.0))
         if len(rows) and least.max() > most:
             worst = int(least.argmax())
-            yield Refused((returns_row(rows[worst]),), float(least[worst]), most)
+            yield (returns_row(rows[worst]),), float(least[worst]), most
 
 
-def _refused_together(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -> Iterator[Refused]:
+def _refused_together(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -> Iterator[_Found]:
     """The set of two that is refused most clearly. Of more than MOST_SETS sets that the bound does not pass, as many are looked at, evenly spread."""
     rows = np.array(sorted(returns, key=lambda r: r[1]), dtype=int).reshape(-1, 3)
     thresholds = {freedom: _most(theory, freedom, together=True) for freedom in (4, 5, 6)}
-    worst: Refused | None = None
+    worst: _Found | None = None
     for first, second in _sets(rows, drifts.none, min(thresholds.values())):
         least = np.full(len(first), np.inf)
         most = np.array([thresholds[f] for f in (rows[first, 2] + rows[second, 2]).tolist()])
@@ -240,9 +284,9 @@ def _refused_together(returns: Sequence[Return], drifts: _Drifts, theory: Theory
                 break
             least[left] = np.minimum(least[left], _square_together(filtered, rows, first[left], second[left]) + unlikely)
         excess = least - most
-        if len(excess) and excess.max() > (worst.square - worst.most if worst else 0.0):
+        if len(excess) and excess.max() > (worst[1] - worst[2] if worst else 0.0):
             k = int(excess.argmax())
-            worst = Refused((returns_row(rows[first[k]]), returns_row(rows[second[k]])), float(least[k]), float(most[k]))
+            worst = (returns_row(rows[first[k]]), returns_row(rows[second[k]])), float(least[k]), float(most[k])
     if worst:
         yield worst
 

@@ -17,8 +17,10 @@ so until there are twice as many.
 
 from __future__ import annotations
 
+import math
+from bisect import bisect
 from collections import defaultdict, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -63,15 +65,16 @@ class Displacement:
         return cls(theory.reject, theory.joint, theory.returns, topological, "turn_stays" in hard, "functional_view" in hard)
 
     def pairs(self, trace: Trace) -> Pairs:
-        return self._of(trace).pairs
+        return self.returns_of(trace).pairs
 
     def facts(self, trace: Trace, start: int, stop: int) -> str:
         return ""
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        return self._of(trace).refused_together(ssh_map, since) if self.joint > 1 else None
+        return self.returns_of(trace).refused_together(ssh_map, since) if self.joint > 1 else None
 
-    def _of(self, trace: Trace) -> Returns:
+    def returns_of(self, trace: Trace) -> Returns:
+        """The returns that a trace may have."""
         return _returns(self, trace)
 
 
@@ -253,6 +256,10 @@ class Returns:
         labels  the dstate of each step
         places  the place of each dstate
         """
+        return self._returns_among(labels, [places[label] for label in labels], since)
+
+    def _returns_among(self, labels: Sequence[int], places: Sequence[int | None], since: int = 0) -> Steps:
+        """The same, where `places` has the place of each step."""
         import numpy as np
 
         at_dstate: dict[int, list[int]] = defaultdict(list)
@@ -260,7 +267,7 @@ class Returns:
         for t in self.arrivals:
             if t < len(labels):
                 at_dstate[labels[t]].append(t)
-                at_place[places[labels[t]]].append(t)
+                at_place[places[t]].append(t)
         at_place.pop(None, None)
         found = []
         for groups, one_dstate in ((at_dstate, True), (at_place, False)):
@@ -294,6 +301,88 @@ class Returns:
             del self._accepted[next(iter(self._accepted))]
         return None
 
+    def refused_at(self, labels: Sequence[int], places: Sequence[int | None], step: int) -> frozenset[Equality] | None:
+        """The two returns that are refused together most clearly, though none is alone, and the later of which ends at this step; None where no two are.
+
+        labels, places  the dstate and the place of each step, which need not be those of a map
+        """
+        alone = self.pairs
+        rows = self._returns_among(labels[: step + 1], places)
+        refused = [i in (alone.apart if one_dstate else alone.elsewhere).get(j, ()) for i, j, one_dstate in rows.tolist()]
+        rows = rows[[not is_refused for is_refused in refused]]
+        worst = self._together(rows).worst(rows[:, 1] == step)
+        if worst is None:
+            return None
+        return frozenset(Equality(int(i), int(j), "dstate" if one_dstate else "place") for i, j, one_dstate in worst)
+
+    def refused_alone_at(self, labels: Sequence[int], places: Sequence[int | None], step: int) -> list[Equality]:
+        """The returns that are refused alone and end at this step, where `labels` and `places` have the dstate and the place of each step."""
+        elsewhere = [Equality(i, step, "place") for i in self.pairs.elsewhere.get(step, ()) if places[i] == places[step] is not None]
+        return elsewhere + [Equality(i, step) for i in self.pairs.apart.get(step, ()) if labels[i] == labels[step]]
+
+    def excess(self, refused: Equality) -> float:
+        """How clearly a return is refused alone: its chi-square, less the threshold."""
+        import numpy as np
+
+        from ssh_abduction.theory.loops import chi_squares
+
+        first, last, which = refused.first, refused.second, int(refused.of == "dstate")
+        squares = chi_squares(*self.reckoning.loops_of_unknown_drift().closings(np.array([first]), np.array([last])))
+        return float(squares[which][0]) - self.threshold(2 + which, together=False)
+
+    def why_apart(self, first: int, last: int, number_from: int = 0) -> str | None:
+        """What keeps two steps from being at one place, or one dstate, in words; None where displacements do not.
+
+        number_from  the number of the first step of the trace, where that is part of a longer one
+        """
+        named = f"steps {first + number_from} and {last + number_from}"
+        i, j = self._begin_of_visit(first), self._begin_of_visit(last)
+        if i in self.pairs.elsewhere.get(j, ()):
+            they = "they" if (i, j) == (first, last) else f"steps {i + number_from} and {j + number_from}, where their visits begin,"
+            return f"{named} are not at one place: by the odometry {they} are {self.closing(i, j).metres} apart"
+        if first not in self.pairs.apart.get(last, ()):
+            return None
+        closing = self.closing(first, last)
+        far, turned = closing.square_of_position > self.threshold(2, False), closing.square_of_heading > self.threshold(1, False)
+        if turned and not far:
+            return f"{named} are not one dstate: by the odometry their headings are {closing.degrees} apart"
+        off = closing.metres if far else f"{closing.metres} and {closing.degrees}"
+        return f"{named} are not one dstate: by the odometry they are {off} apart"
+
+    def why_not_both(self, returns: Collection[Equality], number_from: int = 0) -> str:
+        """What keeps two returns, which are refused together, from being true, in words."""
+        ordered = sorted(returns, key=lambda e: (e.second, e.first, e.of))
+        closings = [self.closing(e.first, e.second) for e in ordered]
+        named = ", and ".join(f"steps {e.first + number_from} and {e.second + number_from}" for e in ordered)
+        ways = " and ".join(f"{closing.way:.0f} m" for closing in closings)
+        sizes = " and ".join(f"{closing.size:.1f} m" for closing in closings)
+        turned = [abs(math.degrees(closing.turned)) for e, closing in zip(ordered, closings, strict=True) if e.of == "dstate"]
+        headings = f", and {' and '.join(f'{angle:.0f}' for angle in turned)} degrees in heading" if any(map(round, turned)) else ""
+        return f"{named} cannot both be returns: the loops of {ways} close {sizes} off{headings}"
+
+    def closing(self, first: int, last: int) -> Closing:
+        """How far off the loop from one step to another closes, by dead reckoning; what repeats in all displacements counts as uncertainty."""
+        import numpy as np
+
+        from ssh_abduction.theory.loops import chi_squares
+
+        loops = self.reckoning.loops_of_unknown_drift()
+        off, covariance = loops.closings([first], [last])
+        size = float(np.hypot(*off[0, :2]))
+        along = off[0, :2] / size if size else np.array([1.0, 0.0])
+        return Closing(
+            way=float(loops.ways[last, 0] - loops.ways[first, 0]),
+            size=size,
+            size_sigma=math.sqrt(along @ covariance[0, :2, :2] @ along),
+            turned=float(off[0, 2]),
+            turned_sigma=math.sqrt(covariance[0, 2, 2]),
+            square_of_position=float(chi_squares(off, covariance)[0][0]),
+        )
+
+    def _begin_of_visit(self, step: int) -> int:
+        """The first step of the visit that a step belongs to, as far as turns stay at their place."""
+        return self.arrivals[bisect(self.arrivals, step) - 1] if self.evidence.turns_stay else step
+
     def _together(self, rows: Steps, before: Together | None = None) -> Together:
         from ssh_abduction.theory.together import Together  # loads numpy
 
@@ -311,6 +400,38 @@ class Returns:
         codes, known_codes = ((found[:, 0] * size + found[:, 1]) * 2 + found[:, 2] for found in (rows, known))
         new: Mask = np.isin(codes, known_codes, invert=True)
         return new
+
+
+@dataclass(frozen=True)
+class Closing:
+    """How far off a loop closes: metres and radians, each with its standard deviation.
+
+    way                 driven from its first step to its last one, in metres
+    size, size_sigma    the distance of its ends, and the uncertainty of that, along the line between them
+    square_of_position  the chi-square of where it ends, with two degrees of freedom
+    """
+
+    way: float
+    size: float
+    size_sigma: float
+    turned: float
+    turned_sigma: float
+    square_of_position: float
+
+    @property
+    def square_of_heading(self) -> float:
+        """The chi-square of the heading in which it ends, with one degree of freedom."""
+        return (self.turned / self.turned_sigma) ** 2
+
+    @property
+    def metres(self) -> str:
+        """11.2 ± 1.4 m"""
+        return f"{self.size:.1f} ± {self.size_sigma:.1f} m"
+
+    @property
+    def degrees(self) -> str:
+        """90 ± 3 degrees"""
+        return f"{abs(math.degrees(self.turned)):.0f} ± {math.degrees(self.turned_sigma):.0f} degrees"
 
 
 class _Course(NamedTuple):
