@@ -1,6 +1,6 @@
 """A map as a picture: paths through places, and at each place its dstates, on the side that they face.
 
-The map says nothing of metres, so the layout is one of many. Where all turns fit right angles, paths are drawn at right angles
+Where displacements say where the dstates are, they are drawn there (see `metric_picture`). Elsewhere the map says nothing of metres, so the layout is one of many. Where all turns fit right angles, paths are drawn at right angles
 and places keep their order along them. Elsewhere places are spread so that neighbours are near each other (Kamada & Kawai 1989).
 """
 
@@ -8,21 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from html import escape
 from itertools import combinations, pairwise
 from typing import Any, TypeAlias
 
 import networkx as nx
 
-from ssh_abduction.maps import SSHMap, xml_text
+from ssh_abduction.drawing import COLOURS, RADIUS, escaped, page, text
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.metric_picture import located, metric_svg
 
 Point: TypeAlias = tuple[float, float]
 
-# In units of the page: between neighbouring places, around the picture, the radius of a place, from the middle of a place to the name of a dstate, and how far a
-# dstate is drawn beside the line of its path.
-SPACING, MARGIN, RADIUS, DSTATE, LANE = 130.0, 80.0, 17.0, 38.0, 9.0
-# The colours of the paths, in turn. The first six are of the palette of Okabe & Ito, which people who are colour-blind can tell apart.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b")
+# In units of the page: between neighbouring places, from the middle of a place to the name of a dstate, and how far a dstate is drawn beside the line of its path.
+SPACING, DSTATE, LANE = 130.0, 38.0, 9.0
 # Characters of a view that are shown below a dstate: longer ones would run into the neighbours. The end is kept, as long names often begin alike.
 LONGEST_LABEL = 20
 QUARTERS = {"right": 1, "around": 2, "left": 3}
@@ -34,9 +32,11 @@ def svg(ssh_map: SSHMap, turns: Mapping[str, str] | None = None) -> str:
 
     turns  which way actions turn ("right", "left" or "around"), by name; actions of these three names need none
     """
+    if (where := located(ssh_map)) is not None:
+        return metric_svg(ssh_map, where)
     if not ssh_map.places:
-        return _page(*_causal(ssh_map))
-    return _page(*_topological(ssh_map, layout(ssh_map, turns)))
+        return page(*_causal(ssh_map))
+    return page(*_topological(ssh_map, layout(ssh_map, turns)))
 
 
 def layout(ssh_map: SSHMap, turns: Mapping[str, str] | None = None) -> dict[int, Point]:
@@ -135,20 +135,20 @@ def _topological(ssh_map: SSHMap, at: Mapping[int, Point]) -> tuple[list[str], l
         colour = COLOURS[path.id % len(COLOURS)]
         points = [at[p] for p in path.order]
         if len(points) > 1:
-            text = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+            line = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
             lines.append(
-                f'<polyline points="{text}" fill="none" stroke="{colour}" stroke-width="9" stroke-linecap="round" opacity="0.55"/>'
+                f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="9" stroke-linecap="round" opacity="0.55"/>'
             )
             (ax, ay), (bx, by) = points[0], points[1]
             (mx, my), angle = ((ax + bx) / 2, (ay + by) / 2), math.degrees(math.atan2(by - ay, bx - ax))
             marks.append(f'<path d="M-7,-6 L7,0 L-7,6 Z" fill="{colour}" transform="translate({mx:.1f},{my:.1f}) rotate({angle:.1f})"/>')
             nx_, ny = -(by - ay), bx - ax
             far = 26 / math.hypot(nx_, ny)
-            marks.append(_text(mx + nx_ * far, my + ny * far, f"path {path.id}", colour))
+            marks.append(text(mx + nx_ * far, my + ny * far, f"path {path.id}", colour))
     for place in ssh_map.places:
         x, y = at[place]
         marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{RADIUS}" fill="white" stroke="#222" stroke-width="2"/>')
-        marks.append(_text(x, y, str(place), "#222", size=15, weight="bold"))
+        marks.append(text(x, y, str(place), "#222", size=15, weight="bold"))
         marks += _dstates(ssh_map, place, at)
     return lines + marks, list(at.values())
 
@@ -168,10 +168,10 @@ def _dstates(ssh_map: SSHMap, place: int, at: Mapping[int, Point]) -> list[str]:
         title = f"dstate {s.id}: {s.view}"
         px, py = x + dx * (RADIUS + 6) + aside[0], y + dy * (RADIUS + 6) + aside[1]
         marks.append(
-            f'<g><title>{_escaped(title)}</title><path d="M-5,-5 L5,0 L-5,5 Z" fill="{colour}" '
+            f'<g><title>{escaped(title)}</title><path d="M-5,-5 L5,0 L-5,5 Z" fill="{colour}" '
             f'transform="translate({px:.1f},{py:.1f}) rotate({math.degrees(bearing):.1f})"/></g>'
         )
-        marks.append(_text(x + dx * DSTATE + aside[0] * 1.5, y + dy * DSTATE + aside[1] * 1.5, f"x{s.id}", "#222", halo=True))
+        marks.append(text(x + dx * DSTATE + aside[0] * 1.5, y + dy * DSTATE + aside[1] * 1.5, f"x{s.id}", "#222", halo=True))
     return marks
 
 
@@ -217,35 +217,11 @@ def _causal(ssh_map: SSHMap) -> tuple[list[str], list[Point]]:
         marks.append(f'<path d="M{ax:.1f},{ay:.1f} Q{mx:.1f},{my:.1f} {ex:.1f},{ey:.1f}" fill="none" stroke="#888" stroke-width="1.5"/>')
         angle = math.degrees(math.atan2(ey - my, ex - mx))
         marks.append(f'<path d="M-8,-4 L0,0 L-8,4 Z" fill="#888" transform="translate({ex:.1f},{ey:.1f}) rotate({angle:.1f})"/>')
-        marks.append(_text(mx - ux * 12, my - uy * 12, ", ".join(names), "#555", halo=True))
+        marks.append(text(mx - ux * 12, my - uy * 12, ", ".join(names), "#555", halo=True))
     for s in ssh_map.dstates:
         x, y = at[s.id]
         marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{RADIUS}" fill="white" stroke="{COLOURS[0]}" stroke-width="2"/>')
-        marks.append(_text(x, y, f"x{s.id}", "#222", weight="bold"))
+        marks.append(text(x, y, f"x{s.id}", "#222", weight="bold"))
         label = str(s.view) if len(str(s.view)) <= LONGEST_LABEL else f"…{str(s.view)[1 - LONGEST_LABEL :]}"
-        marks.append(f"<g><title>{_escaped(f'dstate {s.id}: {s.view}')}</title>{_text(x, y + RADIUS + 12, label, '#222', halo=True)}</g>")
+        marks.append(f"<g><title>{escaped(f'dstate {s.id}: {s.view}')}</title>{text(x, y + RADIUS + 12, label, '#222', halo=True)}</g>")
     return marks, list(at.values())
-
-
-def _text(x: float, y: float, text: str, colour: str, size: int = 12, weight: str = "normal", halo: bool = False) -> str:
-    edge = ' stroke="white" stroke-width="3" paint-order="stroke"' if halo else ""
-    return (
-        f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size}" font-weight="{weight}" fill="{colour}"{edge} '
-        f'text-anchor="middle" dominant-baseline="central">{_escaped(text)}</text>'
-    )
-
-
-def _escaped(text: str) -> str:
-    return escape(xml_text(text))
-
-
-def _page(marks: list[str], points: list[Point]) -> str:
-    xs, ys = [x for x, _ in points] or [0.0], [y for _, y in points] or [0.0]
-    left, top = min(xs) - MARGIN, min(ys) - MARGIN
-    width, height = max(xs) + MARGIN - left, max(ys) + MARGIN - top
-    head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{left:.0f} {top:.0f} {width:.0f} {height:.0f}" '
-        f'width="{width:.0f}" height="{height:.0f}" font-family="Helvetica, Arial, sans-serif">'
-    )
-    background = f'<rect x="{left:.0f}" y="{top:.0f}" width="{width:.0f}" height="{height:.0f}" fill="white"/>'
-    return "\n".join([head, background, *marks, "</svg>"])

@@ -6,7 +6,8 @@ import argparse
 
 from ssh_abduction.cli.options import Verbs, check_number
 from ssh_abduction.cli.text import describe
-from ssh_abduction.errors import MapError
+from ssh_abduction.errors import MapError, named
+from ssh_abduction.files import write_file
 from ssh_abduction.maps import maps_of, read_json
 
 
@@ -18,7 +19,14 @@ def add_parser(verbs: Verbs) -> None:
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--dot", action="store_true", help="Graphviz DOT: a node a dstate, a cluster a place")
     form.add_argument("--graphml", action="store_true", help="GraphML: a node a dstate")
-    form.add_argument("--svg", action="store_true", help="a picture: places, and paths as streets through them")
+    form.add_argument(
+        "--svg",
+        nargs="?",
+        const="-",
+        type=svg_file,
+        metavar="FILE.svg",
+        help="a picture: places, and paths as streets through them, in metres where displacements were used (without a name: to standard output)",
+    )
     parser.set_defaults(run=run)
 
 
@@ -38,9 +46,30 @@ def run(options: argparse.Namespace) -> int:
     elif options.svg:
         from ssh_abduction.picture import svg
 
-        print(svg(chosen))
+        picture = svg(chosen)
+        if options.svg == "-":
+            print(picture)
+        else:
+            write_picture(options.svg, picture)
     elif options.map:
         print(describe(chosen))
     else:
         print("\n\n".join(f"map {i + 1}\n{describe(m)}" for i, m in enumerate(maps)))
     return 0
+
+
+def svg_file(name: str) -> str:
+    """A file that a map is drawn into. The name has to end in .svg, so that no file of maps is taken for it and replaced."""
+    if name != "-" and not name.lower().endswith(".svg"):
+        raise argparse.ArgumentTypeError(f"expected a name that ends in .svg, got {name!r}")
+    return name
+
+
+def write_picture(name: str, picture: str) -> None:
+    """Write the picture. Raises MapError."""
+    try:
+        write_file(name, f"{picture}\n".encode())
+    except OSError as error:
+        raise MapError(f"{named(name)}: cannot write the picture: {error.strerror or error}; check the folder") from None
+    except ValueError as error:
+        raise MapError(f"--svg: cannot write the picture: {error}; name a file") from None

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from perception.recognition import LearningCurve
 from simulator.laser import BEARINGS
 from simulator.world import World
+from ssh_abduction.drawing import COLOURS
 from ssh_abduction.errors import SSHError
 from ssh_abduction.files import write_file
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.picture import COLOURS, SPACING, layout
+from ssh_abduction.picture import SPACING, layout
 from ssh_abduction.reproduce.claims import Outcome
 
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"

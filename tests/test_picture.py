@@ -1,0 +1,185 @@
+"""Maps drawn where their dstates are: metres, headings, ellipses of uncertainty, a page that holds all."""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from worlds import TOURS, drive
+
+from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction.cli import main
+from ssh_abduction.maps import DState, Fit, Pose
+from ssh_abduction.maps import Path as Street
+from ssh_abduction.picture import svg
+
+SVG = "{http://www.w3.org/2000/svg}"
+SQUARE = [(10.0, 0.3, 0.02), (0.0, 0.0, math.pi / 2)] * 4
+
+
+@cache
+def surveyed(theory: str = "topological") -> SSHMap:
+    """The map of a square that the robot drove round once, turning left at each corner."""
+    trace = Trace.from_steps("abcdefgha", ["travel", "left"] * 4, displacements=SQUARE)
+    return solve(trace, {"topological": Theory.topological, "causal": Theory.causal}[theory]()).maps[0]
+
+
+def grid(side: int, apart: float = 8.0) -> SSHMap:
+    """A map of side x side places, each with dstates to all four sides, on two sets of paths, and positions that are known the less the farther they are."""
+    draw, dstates, poses = random.Random(1), [], []
+    for place in range(side * side):
+        x, y = place % side, place // side
+        at = (apart * x + draw.gauss(0, 0.3), apart * y + draw.gauss(0, 0.3)) if place else (0.0, 0.0)
+        for quarter in range(4):
+            path = y if quarter % 2 == 0 else side + x
+            dstates.append(DState(len(dstates), f"view {len(dstates)}", place, path, 1 if quarter < 2 else -1))
+            poses.append(Pose(*at, math.remainder(quarter * math.pi / 2, math.tau), (0.01 * x, 0.002 * (x - y), 0.02 * y)))
+    rows = [Street(y, tuple(y * side + x for x in range(side))) for y in range(side)]
+    columns = [Street(side + x, tuple(y * side + x for y in range(side))) for x in range(side)]
+    east = [(4 * p, "travel", 4 * p + 4) for p in range(side * side) if p % side < side - 1]
+    return SSHMap((0,), tuple(dstates), tuple(east), tuple(range(side * side)), (*rows, *columns), fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))
+
+
+def dots(picture: str) -> dict[str, tuple[float, float]]:
+    """Where the dots are, by what they stand for."""
+    groups = [group for group in ET.fromstring(picture).iter(f"{SVG}g") if group.find(f"{SVG}circle") is not None]
+    return {
+        str(group.findtext(f"{SVG}title")): (float(circle.attrib["cx"]), float(circle.attrib["cy"]))
+        for group in groups
+        if (circle := group.find(f"{SVG}circle")) is not None
+    }
+
+
+def page(picture: str) -> tuple[float, float, float, float]:
+    left, top, width, height = map(float, ET.fromstring(picture).attrib["viewBox"].split())
+    return left, top, left + width, top + height
+
+
+@pytest.mark.parametrize("theory", ["topological", "causal"])
+def test_dots_are_where_the_dstates_are(theory: str) -> None:
+    ssh_map = surveyed(theory)
+    assert ssh_map.fit is not None
+    found = dots(svg(ssh_map))
+    names = [f"place {s.place}" if s.place is not None else f"dstate {s.id}" for s in ssh_map.dstates]
+    assert set(found) == set(names)
+    metres = np.array([(pose.x, -pose.y) for pose in ssh_map.fit.poses])  # y is down on the page
+    drawn = np.array([found[name] for name in names])
+    scale = np.linalg.norm(drawn[2] - drawn[0]) / np.linalg.norm(metres[2] - metres[0])
+    assert np.abs(drawn - drawn[0] - scale * (metres - metres[0])).max() < 0.2
+    assert scale > 5
+
+
+def test_the_bar_is_as_long_as_it_says() -> None:
+    ssh_map = grid(4, apart=8.0)
+    picture = svg(ssh_map)
+    (metres,) = (float(found) for found in re.findall(r">([0-9.]+) m<", picture))
+    left, right = (float(found) for found in re.findall(r'<path d="M([-0-9.]+),[-0-9.]+ v10 m0,-5 H([-0-9.]+) ', picture)[0])
+    at = dots(picture)
+    assert ssh_map.fit is not None
+    across = ssh_map.fit.poses[4 * 3].x - ssh_map.fit.poses[0].x
+    assert (right - left) / metres == pytest.approx((at["place 3"][0] - at["place 0"][0]) / across, rel=0.01)
+
+
+def test_arrows_point_where_the_dstates_face() -> None:
+    ssh_map = surveyed()
+    assert ssh_map.fit is not None
+    turned = {}
+    for group in ET.fromstring(svg(ssh_map)).iter(f"{SVG}g"):
+        if (number := re.match(r"dstate (\d+):", str(group.findtext(f"{SVG}title")))) and (arrow := group.find(f"{SVG}path")) is not None:
+            turned[int(number[1])] = float(re.findall(r"rotate\(([-0-9.]+)\)", arrow.attrib["transform"])[0])
+    assert turned == pytest.approx({s: -math.degrees(pose.heading) for s, pose in enumerate(ssh_map.fit.poses)}, abs=0.1)
+
+
+def test_ellipses_have_the_axes_of_the_covariance() -> None:
+    ssh_map = grid(3)
+    assert ssh_map.fit is not None
+    picture = svg(ssh_map)
+    at = dots(picture)
+    scale = math.dist(at["place 0"], at["place 2"]) / math.hypot(ssh_map.fit.poses[8].x, ssh_map.fit.poses[8].y)
+    found = {(float(e.attrib["cx"]), float(e.attrib["cy"])): e.attrib for e in ET.fromstring(picture).iter(f"{SVG}ellipse")}
+    assert at["place 0"] not in found
+    assert len(found) == 8
+    for place in range(1, 9):
+        xx, xy, yy = ssh_map.fit.poses[4 * place].spread
+        values, vectors = np.linalg.eigh([[xx, xy], [xy, yy]])
+        drawn = found[at[f"place {place}"]]
+        assert float(drawn["rx"]) == pytest.approx(2 * scale * math.sqrt(values[1]), abs=0.1)
+        assert float(drawn["ry"]) == pytest.approx(2 * scale * math.sqrt(max(0.0, values[0])), abs=0.1)
+        angle = math.radians(-float(re.findall(r"rotate\(([-0-9.]+) ", drawn["transform"])[0]))
+        assert abs(vectors[:, 1] @ (math.cos(angle), math.sin(angle))) == pytest.approx(1, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "ssh_map", [surveyed(), surveyed("causal"), grid(2), grid(9), grid(3, apart=0.02)], ids=["square", "causal", "four", "many", "near"]
+)
+def test_nothing_lies_outside_the_page(ssh_map: SSHMap) -> None:
+    picture = svg(ssh_map)
+    left, top, right, bottom = page(picture)
+    inside = []
+    for mark in ET.fromstring(picture).iter():
+        if mark.tag == f"{SVG}text":
+            wide = 0.35 * float(mark.attrib["font-size"]) * len(str(mark.text))
+            x, y = float(mark.attrib["x"]), float(mark.attrib["y"])
+            inside += [(x - wide, y), (x + wide, y)]
+        elif mark.tag in (f"{SVG}circle", f"{SVG}ellipse"):
+            x, y, far = (float(mark.attrib[name]) for name in ("cx", "cy", "r" if mark.tag == f"{SVG}circle" else "ry"))
+            inside += [(x - far, y - far), (x + far, y + far)]
+        elif "M0,0" not in mark.attrib.get("d", "M0,0") and "transform" not in mark.attrib:
+            inside += [(float(x), float(y)) for x, y in re.findall(r"([-0-9.]+),([-0-9.]+)", mark.attrib["d"]) if float(x)]
+    assert len(inside) > 10
+    assert all(left <= x <= right and top <= y <= bottom for x, y in inside)
+    assert max(right - left, bottom - top) < 2600
+
+
+def test_labels_do_not_overlap() -> None:
+    for ssh_map in (grid(2), grid(9), grid(3, apart=0.02), surveyed("causal")):
+        boxes = []
+        for mark in ET.fromstring(svg(ssh_map)).iter(f"{SVG}text"):
+            size, x, y = (float(mark.attrib[name]) for name in ("font-size", "x", "y"))
+            wide = 0.3 * size * len(str(mark.text))
+            boxes.append((x - wide, y - size / 2, x + wide, y + size / 2))
+        for i, (left, top, right, bottom) in enumerate(boxes):
+            assert all(right <= l or r <= left or bottom <= t or b <= top for l, t, r, b in boxes[:i])  # noqa: E741
+
+
+def test_each_place_of_a_large_map_is_named() -> None:
+    ssh_map = grid(9)
+    named = {str(mark.text) for mark in ET.fromstring(svg(ssh_map)).iter(f"{SVG}text")}
+    assert {str(p) for p in ssh_map.places} <= named
+    assert "x0 start" in named
+
+
+def test_maps_without_poses_are_drawn_as_before() -> None:
+    (without,) = solve(drive(*TOURS["comb"]), Theory.circumscriptive()).maps
+    before = svg(without)
+    poses = [Pose(0.1 * s.id, 0.0, 0.0) for s in without.dstates]
+    assert svg(replace(without, fit=Fit(1.0, 1, 0.5))) == before
+    assert svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) != before
+    other = next(s.id for s in without.dstates if s.place != without.dstates[0].place)
+    poses[other] = Pose(0.0, 0.0, 0.0)  # a part of the map which no displacement connects with the rest has poses of its own
+    assert svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) == before
+    poses[other] = Pose(1e300, 0.0, 0.0)
+    assert svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) == before
+
+
+def test_the_file_is_written_where_it_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    surveyed().save(tmp_path / "maps.json")
+    assert main(["show", str(tmp_path / "maps.json"), "--svg", str(tmp_path / "map.svg")]) == 0
+    assert capsys.readouterr().out == ""
+    assert main(["show", str(tmp_path / "maps.json"), "--svg"]) == 0
+    written = (tmp_path / "map.svg").read_text()
+    assert written == capsys.readouterr().out
+    assert "place 3" in written
+    assert main(["show", str(tmp_path / "maps.json"), "--svg", str(tmp_path / "no" / "map.svg")]) == 1
+    assert "cannot write the picture" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["show", str(tmp_path / "other.json"), "--svg", str(tmp_path / "maps.json")])
+    assert "expected a name that ends in .svg" in capsys.readouterr().err
+    assert SSHMap.load(tmp_path / "maps.json") == surveyed()
