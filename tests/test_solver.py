@@ -331,7 +331,7 @@ def test_limits_that_make_no_sense(choices: dict[str, int], name: str) -> None:
     ("choices", "message"),
     [
         ({"boundary": "soft"}, "boundary: expected one of none, strict, defeasible, got 'soft'"),
-        ({"prefer": ("dstates", "streets")}, "prefer: expected names out of dstates, paths, places, excuses, got 'streets'"),
+        ({"prefer": ("dstates", "streets")}, "prefer: expected names out of dstates, paths, places, excuses, auto, got 'streets'"),
         ({"prefer": ("dstates", "dstates")}, "prefer: expected each name once"),
         ({"prefer": ("excuses",)}, "prefer: expected no excuses with boundary=strict"),
         ({"without": ("gravity",)}, "without: expected names out of"),
@@ -550,12 +550,16 @@ def test_renaming_and_mirroring_leave_the_maps_alone(case: tuple[Trace, Theory])
     shapes = {shape(m) for m in solve(trace, theory, maps=0).maps}
     stars = [step.star for step in trace.steps] if trace.has_stars else None
     views = [f"seen {v}" for v in trace.views]
+    moved = [step.displacement for step in trace.steps[1:]] if trace.has_displacements else None
     renamed = [{"name": f"do {a.name}", "kind": a.kind, "turn": a.turn} for a in trace.actions]
-    assert {shape(m) for m in solve(Trace.from_steps(views, renamed, stars=stars), theory, maps=0).maps} == shapes
+    again = Trace.from_steps(views, renamed, stars=stars, displacements=moved, odometry=trace.odometry)
+    assert {shape(m) for m in solve(again, theory, maps=0).maps} == shapes
     flip = {"right": "left", "left": "right", "around": "around", None: None}
     mirrored = [{"name": a.name, "kind": a.kind, "turn": flip[a.turn]} for a in trace.actions]
     turned = [None if s is None else (s[0], s[3], s[2], s[1]) for s in stars] if stars else None
-    assert {shape(m) for m in solve(Trace.from_steps(views, mirrored, stars=turned), theory, maps=0).maps} == shapes
+    mirrored_moves = [None if d is None else (d[0], -d[1], -d[2]) for d in moved] if moved else None
+    mirror = Trace.from_steps(views, mirrored, stars=turned, displacements=mirrored_moves, odometry=trace.odometry)
+    assert {shape(m) for m in solve(mirror, theory, maps=0).maps} == shapes
 
 
 def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
