@@ -285,10 +285,10 @@ class Returns:
         import numpy as np
 
         labels, places = ssh_map.labels, tuple(s.place for s in ssh_map.dstates)
-        course = _Course(labels, places)
+        course = _Course.of(labels, places)
         if course in self._accepted:
             return None
-        before = self._accepted.pop(_Course(labels[:since], places), None)
+        before = self._accepted.pop(_Course.of(labels[:since], places), None)
         rows = self._returns_of(labels, places, since if before else 0)
         if before:
             rows = np.concatenate([before.rows, rows])
@@ -439,6 +439,11 @@ class _Course(NamedTuple):
 
     labels: tuple[int, ...]
     places: tuple[int | None, ...]
+
+    @staticmethod
+    def of(labels: tuple[int, ...], places: tuple[int | None, ...]) -> _Course:
+        """Of the dstates that these steps know: a map may have more, as it grows."""
+        return _Course(labels, places[: max(labels, default=-1) + 1])
 
 
 def _parts(size: int, most: int = AT_A_TIME) -> Iterator[slice]:
