@@ -31,6 +31,7 @@ from scipy.special import gammaincc
 
 from ssh_abduction.maps import Fit, Pose, SSHMap
 from ssh_abduction.odometry import Odometry
+from ssh_abduction.theory.loops import turned
 from ssh_abduction.trace import Trace
 
 Array: TypeAlias = NDArray[np.float64]
@@ -39,14 +40,13 @@ Array: TypeAlias = NDArray[np.float64]
 EXACT = 2e-3
 
 
-def fit(trace: Trace, ssh_map: SSHMap, start: Sequence[Pose] | None = None) -> Fit:
+def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
     """The poses of the dstates of a map that agree best with the displacements, and how well they do.
 
     trace    with displacements on some of its steps
     ssh_map  a map of all of its steps
-    start    poses to begin with, such as those of a map that is nearly the same; without them headings are found first, then positions
     """
-    return _Problem(trace, ssh_map).solved(start)
+    return _Problem(trace, ssh_map).solved()
 
 
 class _Problem:
@@ -72,8 +72,8 @@ class _Problem:
         self._positions, self._headings = len(number), len(places)
         self._size = 2 * self._positions + self._headings + 2
 
-    def solved(self, start: Sequence[Pose] | None) -> Fit:
-        unknown = self._begun(start)
+    def solved(self) -> Fit:
+        unknown = self._begun()
         if len(self._moved):
             found = least_squares(self._residuals, unknown, self._jacobian, method="trf", tr_solver="lsmr", x_scale="jac", max_nfev=50)
             unknown = found.x
@@ -83,27 +83,20 @@ class _Problem:
         scale, bend = (float(x) for x in unknown[-2:] * self._sigma)
         return Fit(squares, freedom, p, scale, bend, self._poses(unknown))
 
-    def _begun(self, start: Sequence[Pose] | None) -> Array:
+    def _begun(self) -> Array:
         """Unknowns to begin with."""
         unknown = np.zeros(self._size)
         at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
-        if start is not None and len(start) == self._headings:
-            at[self._place] = [(pose.x, pose.y) for pose in start]
-            heading[:] = [pose.heading for pose in start]
-            return unknown
         # Headings first, which are linear but for whole turns, and then positions, which are linear where headings are known (Carlone et al. 2014).
         reckoned = self._headings_by_first_visit()
-        turned = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
-        turned -= math.tau * np.round(turned / math.tau)
-        heading[:] = reckoned + _least(
-            self._differences(self._from, self._to, self._headings), turned / self._sigmas(2), 1 / self._sigmas(2)
-        )
-        cos, sin = np.cos(heading[self._from]), np.sin(heading[self._from])
-        moved = np.stack([cos * self._moved[:, 0] - sin * self._moved[:, 1], sin * self._moved[:, 0] + cos * self._moved[:, 1]], axis=1)
+        off = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
+        off -= math.tau * np.round(off / math.tau)
+        heading[:] = reckoned + _least(self._differences(self._from, self._to, self._headings), off / self._sigmas(2), 1 / self._sigmas(2))
+        onward = turned(self._moved[:, :2], heading[self._from])
         differences = self._differences(self._place[self._from], self._place[self._to], self._positions)
         weights = 1 / self._sigmas(0)
         for axis in range(2):
-            at[:, axis] = _least(differences, moved[:, axis] * weights, weights)
+            at[:, axis] = _least(differences, onward[:, axis] * weights, weights)
         return unknown
 
     def _headings_by_first_visit(self) -> Array:
@@ -111,9 +104,9 @@ class _Problem:
         heading = np.zeros(self._headings)
         known: dict[int, float] = {}
         here, last = 0.0, None
-        for s, x, turned in zip(self._from.tolist(), self._to.tolist(), self._moved[:, 2].tolist(), strict=True):
+        for s, x, rotated in zip(self._from.tolist(), self._to.tolist(), self._moved[:, 2].tolist(), strict=True):
             here = known.setdefault(s, here if last == s else 0.0)
-            here, last = here + turned, x
+            here, last = here + rotated, x
             here = known.setdefault(x, here)
         for s, angle in known.items():
             heading[s] = angle
@@ -131,16 +124,16 @@ class _Problem:
         entries = np.concatenate([ones, -ones]), (np.concatenate([rows, rows]), np.concatenate([second, first]))
         return coo_array(entries, shape=(len(first), size)).tocsr()
 
-    def _predicted(self, unknown: Array) -> tuple[Array, Array, Array, Array]:
-        """What each displacement should be, how far it goes in the frame of the map, and the cosine and sine of the heading in its middle."""
+    def _predicted(self, unknown: Array) -> tuple[Array, Array, Array]:
+        """What each displacement should be, and the cosine and sine of the heading in its middle."""
         at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
         scale, bend = unknown[-2:] * self._sigma
         gone = at[self._place[self._to]] - at[self._place[self._from]]
         facing = heading[self._from] - bend * self._way / 2
         cos, sin = np.cos(facing), np.sin(facing)
         ahead, left = cos * gone[:, 0] + sin * gone[:, 1], cos * gone[:, 1] - sin * gone[:, 0]
-        turned = heading[self._to] - heading[self._from] + bend * self._way
-        return np.stack([(1 + scale) * ahead, (1 + scale) * left, turned], axis=1), gone, cos, sin
+        rotated = heading[self._to] - heading[self._from] + bend * self._way
+        return np.stack([(1 + scale) * ahead, (1 + scale) * left, rotated], axis=1), cos, sin
 
     def _residuals(self, unknown: Array) -> Array:
         predicted = self._predicted(unknown)[0]
@@ -149,7 +142,7 @@ class _Problem:
         return np.concatenate([np.einsum("nij,nj->ni", self._whitening, off).ravel(), unknown[-2:]])
 
     def _jacobian(self, unknown: Array) -> csr_array:
-        predicted, _, cos, sin = self._predicted(unknown)
+        predicted, cos, sin = self._predicted(unknown)
         scale = 1 + unknown[-2] * self._sigma[0]
         m, heading = len(self._moved), 2 * self._positions
         zero, one = np.zeros(m), np.ones(m)
@@ -178,12 +171,12 @@ class _Problem:
         )
         return coo_array(entries, shape=(3 * m + 2, self._size)).tocsr()
 
-    def _parts(self) -> tuple[int, NDArray[np.int_]]:
-        """How many parts of the map displacements do not connect, and the part of each position."""
+    def _parts(self) -> NDArray[np.int_]:
+        """The part of the map that each position is in: displacements do not connect one part with another."""
         ends = self._place[self._from], self._place[self._to]
         graph = coo_array((np.ones(len(ends[0])), ends), shape=(self._positions, self._positions))
-        count, part = connected_components(graph, directed=False)
-        return int(count), part
+        part: NDArray[np.int_] = connected_components(graph, directed=False)[1]
+        return part
 
     def _freedom(self, unknown: Array) -> int:
         """The degrees of freedom: what displacements say, without what the poses take up. Each part of the map may be moved and turned as a whole.
@@ -192,7 +185,7 @@ class _Problem:
         """
         said = np.unique(np.concatenate([self._from, self._to]))
         used = np.unique(self._place[said])
-        parts = len(np.unique(self._parts()[1][used]))
+        parts = len(np.unique(self._parts()[used]))
         exact = (1 / np.sqrt((self._whitening**2).sum(1)) < EXACT).ravel()
         settled = int(np.linalg.matrix_rank(self._jacobian(unknown)[: len(exact)][exact].toarray())) if exact.any() else 0
         return int(len(exact) - exact.sum() - (2 * len(used) + len(said) - 3 * parts - settled))
@@ -200,7 +193,7 @@ class _Problem:
     def _poses(self, unknown: Array) -> tuple[Pose, ...]:
         """The poses, each part of the map seen from the first dstate there; and how uncertain the positions are as seen from it."""
         at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
-        _, part = self._parts()
+        part = self._parts()
         first = {int(part[self._place[s]]): s for s in range(self._headings - 1, -1, -1)}
         poses: list[Pose] = []
         spreads = self._spreads(unknown, list(first.values()))
@@ -208,10 +201,10 @@ class _Problem:
             origin = first[int(part[self._place[s]])]
             dx, dy = at[self._place[s]] - at[self._place[origin]]
             cos, sin = math.cos(heading[origin]), math.sin(heading[origin])
-            turned = math.remainder(float(heading[s] - heading[origin]), math.tau)
+            facing = math.remainder(float(heading[s] - heading[origin]), math.tau)
             back = np.array([[cos, sin], [-sin, cos]])
             (xx, xy), (_, yy) = back @ spreads[s] @ back.T
-            poses.append(Pose(float(cos * dx + sin * dy), float(cos * dy - sin * dx), turned, (float(xx), float(xy), float(yy))))
+            poses.append(Pose(float(cos * dx + sin * dy), float(cos * dy - sin * dx), facing, (float(xx), float(xy), float(yy))))
         return tuple(poses)
 
     def _spreads(self, unknown: Array, origins: Sequence[int]) -> Array:

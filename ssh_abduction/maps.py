@@ -202,12 +202,7 @@ class SSHMap:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the map as JSON. Raises MapError."""
-        try:
-            write_file(path, f"{json_line(self.to_dict())}\n".encode())
-        except OSError as error:
-            raise MapError(f"{named(path)}: cannot write the map: {error.strerror or error}; check the folder") from None
-        except ValueError as error:
-            raise MapError(f"output: cannot write the map: {error}; name a file") from None
+        write_map(path, json_line(self.to_dict()))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SSHMap:
@@ -272,6 +267,20 @@ class SSHMap:
             lines.append(f"  subgraph cluster_{p} {{ label={quoted(f'place {p}')}; {inside} }}")
         lines += [f"  {source} -> {target} [label={quoted(action)}];" for source, action, target in self.links]
         return "\n".join([*lines, "}"])
+
+
+def write_map(path: str | os.PathLike[str], text: str, what: str = "map", option: str = "output") -> None:
+    """Write a map, or what is made of it, into a file. Raises MapError.
+
+    what    is written, as messages call it
+    option  by which the file was named
+    """
+    try:
+        write_file(path, f"{text}\n".encode())
+    except OSError as error:
+        raise MapError(f"{named(path)}: cannot write the {what}: {error.strerror or error}; check the folder") from None
+    except ValueError as error:
+        raise MapError(f"{option}: cannot write the {what}: {error}; name a file") from None
 
 
 def _numbered(ids: Iterable[int | None]) -> dict[int | None, int]:

@@ -13,7 +13,7 @@ A square whose corners look alike is explained by a triangle, unless displacemen
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.evaluation import Evaluation, evaluate
@@ -59,11 +59,7 @@ class Rung:
 
 def rungs(trace: Trace, theory: Theory) -> Iterator[tuple[str, Theory]]:
     """The theories of the ladder, each with one kind of evidence more, as far as the trace has it."""
-    choices: dict[str, Any] = {"star": "none", "displacement": "none"}
-    has_planarity = any(field.name == "planar" for field in fields(theory))
-    if has_planarity:
-        choices["planar"] = False
-    theory = theory.replace(**choices)
+    theory = theory.replace(star="none", displacement="none", planar=False)
     yield "views", theory
     topological = theory.level == "topological"
     if topological and trace.has_stars:
@@ -74,7 +70,7 @@ def rungs(trace: Trace, theory: Theory) -> Iterator[tuple[str, Theory]]:
         yield "+ pairs", theory
         theory = theory.replace(joint=2)
         yield "+ geometry", theory
-    if topological and has_planarity:
+    if topological:
         yield "+ planarity", theory.replace(planar=True)
 
 

@@ -145,7 +145,7 @@ def test_the_jacobian_of_a_fit_is_right(data: st.DataObject) -> None:
     problem = _Problem(trace, solve(trace, Theory.causal().replace(displacement="none")).maps[0])
     assume(len(problem._moved))
     rng = np.random.default_rng(0)
-    unknown = problem._begun(None) + 0.01 * rng.normal(size=problem._size)
+    unknown = problem._begun() + 0.01 * rng.normal(size=problem._size)
     numeric = approx_fprime(unknown, problem._residuals, 1e-7)
     assert problem._jacobian(unknown).toarray() == pytest.approx(numeric, abs=2e-3)
 

@@ -6,9 +6,8 @@ import argparse
 
 from ssh_abduction.cli.options import Verbs, check_number
 from ssh_abduction.cli.text import describe
-from ssh_abduction.errors import MapError, named
-from ssh_abduction.files import write_file
-from ssh_abduction.maps import maps_of, read_json
+from ssh_abduction.errors import MapError
+from ssh_abduction.maps import maps_of, read_json, write_map
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -50,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
         if options.svg == "-":
             print(picture)
         else:
-            write_picture(options.svg, picture)
+            write_map(options.svg, picture, "picture", "--svg")
     elif options.map:
         print(describe(chosen))
     else:
@@ -63,13 +62,3 @@ def svg_file(name: str) -> str:
     if name != "-" and not name.lower().endswith(".svg"):
         raise argparse.ArgumentTypeError(f"expected a name that ends in .svg, got {name!r}")
     return name
-
-
-def write_picture(name: str, picture: str) -> None:
-    """Write the picture. Raises MapError."""
-    try:
-        write_file(name, f"{picture}\n".encode())
-    except OSError as error:
-        raise MapError(f"{named(name)}: cannot write the picture: {error.strerror or error}; check the folder") from None
-    except ValueError as error:
-        raise MapError(f"--svg: cannot write the picture: {error}; name a file") from None

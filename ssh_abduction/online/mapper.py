@@ -65,7 +65,7 @@ from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.result import Seconds, Solution, Status
 from ssh_abduction.solver.search import ALL, Search
 from ssh_abduction.steps.log import Outcome, observation
-from ssh_abduction.theory.evidence import NO_PAIRS, Pairs, evidence_of, pairs_of
+from ssh_abduction.theory.evidence import NO_PAIRS, Pairs, evidence_of, pairs_of, said_by
 from ssh_abduction.theory.evidence.displacement import count_returns
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -373,16 +373,8 @@ class OnlineMapper:
             basis=last.basis,
             seconds=Seconds(time.perf_counter() - began, last.seconds.ground if asked else 0.0, last.seconds.solve if asked else 0.0),
             stopped=None if self._complete else self._search.stopped,
-            evidence=self._said_by_evidence(last),
+            evidence=said_by(self._evidence, self.trace, {name: said["refused"] for name, said in last.evidence.items()}),
         )
-
-    def _said_by_evidence(self, asked: Solution) -> dict[str, dict[str, int]]:
-        """As in Solution: how many pairs of steps each kind of evidence excludes, and how many sets of equalities it refused when clingo was asked."""
-        kinds = ((kind.name, kind.pairs(self.trace)) for kind in self._evidence)
-        return {
-            name: {"pairs": sum(map(len, pairs.apart.values())), "refused": asked.evidence.get(name, {}).get("refused", 0)}
-            for name, pairs in kinds
-        }
 
     def _best_draft(self) -> _Draft | None:
         """The best draft that is consistent, or else a sketch of all steps, if there is one."""

@@ -51,14 +51,15 @@ class Judging:
 
     def why_refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
         """Equalities of a map, of the trace or a prefix, that some evidence finds out cannot all hold; None where it refuses none."""
-        return next(iter(self.refusals(ssh_map).values()), None)
+        refusal = self.refusal(ssh_map)
+        return refusal[1] if refusal else None
 
-    def refusals(self, ssh_map: SSHMap) -> dict[str, frozenset[Equality]]:
-        """The same, of the first kind of evidence that refuses the map, by its name."""
+    def refusal(self, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
+        """The same, with the name of the first kind of evidence that refuses the map."""
         for evidence in self._evidence:
             if found := evidence.refuse(self._trace, ssh_map):
-                return {evidence.name: found}
-        return {}
+                return evidence.name, found
+        return None
 
     def allows_grown(self, trace: Trace, ssh_map: SSHMap, since: int) -> bool:
         """Whether no evidence refuses a map of a trace that has grown.

@@ -75,10 +75,12 @@ class Prefixes:
         """A minimal map of the prefix that no evidence refuses, or None where it has no map."""
 
         def why_refused(found: Found) -> frozenset[Equality] | None:
-            for name, equalities in self._judging.refusals(found.map).items():
-                self._known.refused[name] = self._known.refused.get(name, 0) + 1
-                return equalities
-            return None
+            refusal = self._judging.refusal(found.map)
+            if refusal is None:
+                return None
+            name, equalities = refusal
+            self._known.refused[name] = self._known.refused.get(name, 0) + 1
+            return equalities
 
         return first_accepted(self._minimise_as_told, why_refused, self._forbid)
 

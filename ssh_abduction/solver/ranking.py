@@ -28,7 +28,6 @@ class Ranking:
     def __init__(self, trace: Trace) -> None:
         self._trace = trace
         self._known: dict[_Key, Fit] = {}
-        self._last: Fit | None = None
 
     def fitted(self, ssh_map: SSHMap) -> SSHMap:
         """The same map, with how well it closes."""
@@ -36,7 +35,7 @@ class Ranking:
 
         key = ssh_map.labels, tuple(s.place for s in ssh_map.dstates)
         if key not in self._known:
-            self._last = self._known[key] = fit(self._trace, ssh_map)
+            self._known[key] = fit(self._trace, ssh_map)
         return replace(ssh_map, fit=self._known[key])
 
     def ranked(self, maps: Iterator[SSHMap], over: Callable[[], bool]) -> Iterator[SSHMap]:

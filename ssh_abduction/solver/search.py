@@ -65,7 +65,7 @@ from ssh_abduction.solver.ranking import Ranking, noise_warning
 from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solution, Status
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.steps.certificate import Basis
-from ssh_abduction.theory.evidence import evidence_of
+from ssh_abduction.theory.evidence import evidence_of, said_by
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Trace, checked_trace
@@ -487,15 +487,9 @@ class Search:
             within=self.within,
             levels=tuple(self._levels),
             rivals=self._rivals,
-            evidence=self._said_by_evidence(),
+            evidence=said_by(evidence_of(self.theory), self.trace, self._known.refused),
             odometry_warning=noise_warning(self._first.fit if self._first else None),
         )
-
-    def _said_by_evidence(self) -> dict[str, dict[str, int]]:
-        """For each kind of evidence that takes part, how many pairs of steps it excluded, and how many sets of equalities it refused."""
-        refused = self._known.refused
-        kinds = ((kind.name, kind.pairs(self.trace)) for kind in evidence_of(self.theory))
-        return {name: {"pairs": sum(map(len, pairs.apart.values())), "refused": refused.get(name, 0)} for name, pairs in kinds}
 
     def snapshot(self, stopped: Stop) -> Solution:
         """What is known while the search is still under way in another thread that cannot be stopped. The program ends then: it is of no use any more.

@@ -96,7 +96,7 @@ class Loops:
         """
         i, j = np.asarray(first, dtype=int), np.asarray(last, dtype=int)
         closing = self._closing(i, j)
-        covariance = self._shared(i, j, j, j)
+        covariance = self.noise(i, j) + self.repeated(i, j)
         lost = self._heading_variance(i, j)
         moved_by_heading = self._moved_by_heading(i, j)
         bent = (SIGMAS / 2) ** 2 * lost * moved_by_heading + ROUNDED**2
@@ -111,10 +111,6 @@ class Loops:
         begin, end = np.maximum(i, k), np.minimum(j, m)
         covariance = self._white(begin, np.maximum(begin, end), j, m)
         return covariance + self._repeated((i, j), (k, m))
-
-    def _shared(self, i: Steps, j: Steps, end: Steps, other_end: Steps) -> Array:
-        """The covariance of closings by the displacements from i to j, for loops that end at these steps."""
-        return self._white(i, j, end, other_end) + self._repeated((i, j), (i, j))
 
     def _white(self, i: Steps, j: Steps, end: Steps, other_end: Steps) -> Array:
         """What the noise of the displacements after step i, up to j, contributes to the covariance between loops that end at two steps."""
@@ -291,11 +287,11 @@ def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Arr
         if displacement is not None:
             moved[t - start], noise[t - start] = displacement, trace.covariance(t)
     way = np.hypot(moved[:, 0], moved[:, 1])
-    turned = moved[:, 2] - bends[:, None] * way
-    straight = _turned(moved[None, :, :2], -bends[:, None] * way / 2)
-    heading = _summed(last[:, 2], turned)
-    before = heading - turned  # the heading in which each displacement begins
-    onward = _turned(straight, before)
+    rotated = moved[:, 2] - bends[:, None] * way
+    straight = turned(moved[None, :, :2], -bends[:, None] * way / 2)
+    heading = _summed(last[:, 2], rotated)
+    before = heading - rotated  # the heading in which each displacement begins
+    onward = turned(straight, before)
     position = _summed(last[:, :2], onward)
     rotation = np.zeros((*before.shape, 3, 3))
     rotation[..., 0, 0] = rotation[..., 1, 1] = np.cos(before)
@@ -337,7 +333,7 @@ def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
     return by_position, by_position + by_heading
 
 
-def _turned(vectors: Array, angles: Array) -> Array:
+def turned(vectors: Array, angles: Array) -> Array:
     """Vectors, ... x 2, turned counterclockwise by angles."""
     cos, sin = np.cos(angles), np.sin(angles)
     return np.stack([cos * vectors[..., 0] - sin * vectors[..., 1], sin * vectors[..., 0] + cos * vectors[..., 1]], axis=-1)

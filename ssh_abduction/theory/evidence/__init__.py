@@ -12,6 +12,7 @@ variables (`Pairs`), so that evidence makes solving faster. What it finds out on
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from ssh_abduction.theory.evidence.asserted import Asserted
@@ -26,12 +27,20 @@ if TYPE_CHECKING:
 
 KINDS: tuple[type[Evidence], ...] = (Asserted, Displacement, Planar)
 
-__all__ = ["KINDS", "NO_PAIRS", "Asserted", "Displacement", "Equality", "Evidence", "Pairs", "Planar", "evidence_of", "pairs_of"]
+__all__ = ["KINDS", "NO_PAIRS", "Asserted", "Displacement", "Equality", "Evidence", "Pairs", "Planar", "evidence_of", "pairs_of", "said_by"]
 
 
 def evidence_of(theory: Theory) -> tuple[Evidence, ...]:
     """The kinds of evidence that take part in a theory, made for it."""
     return tuple(kind.of(theory) for kind in KINDS if kind.axiom in theory.axioms)
+
+
+def said_by(kinds: Iterable[Evidence], trace: Trace, refused: Mapping[str, int]) -> dict[str, dict[str, int]]:
+    """For each kind of evidence that takes part, how many pairs of steps of a trace it excludes, and how many sets of equalities it refused.
+
+    refused  how many sets, by the name of the kind; 0 for those that are not there
+    """
+    return {kind.name: {"pairs": sum(map(len, kind.pairs(trace).apart.values())), "refused": refused.get(kind.name, 0)} for kind in kinds}
 
 
 def pairs_of(trace: Trace, theory: Theory) -> Pairs:
