@@ -211,7 +211,7 @@ def main() -> None:
     options = arguments().parse_args()
     choices = {name: value for name in ("displacement", "boundary", "prefer") if (value := getattr(options, name))}
     if options.causal:
-        theory = Theory.causal().replace(**choices)
+        theory = Theory.causal().replace(**choices, **({"star": "alike"} if options.stars else {}))
     else:
         theory = Theory.topological().replace(**choices, **({} if options.stars else {"star": "none"}))
     print(f"\n{report(chosen(options), theory, options.limit)}")

@@ -29,6 +29,7 @@ from simulator.motion import Pose, between, reported
 from ssh_abduction.errors import brief, is_whole, named, printable
 from ssh_abduction.files import read_at_most
 from ssh_abduction.odometry import Odometry
+from ssh_abduction.star import Gateway as Sighted
 from ssh_abduction.trace import Action, Step, Trace
 
 Point = tuple[float, float]
@@ -214,7 +215,7 @@ def tour(
 
     odometry     the noise that is drawn for the displacements, and that the trace says they have; without it they are exact
     scale, bend  errors that repeat, as in simulator.motion.reported
-    apart        degrees by which the doors of a room are told apart, as in Plan.told_apart
+    apart        degrees by which the doors of a room are told apart, as in Plan.told_apart. A bearing is off by a quarter of that at most, so that no two doors look like one
     The truth has dstate, place, path and pose. Raises SimulatorError where no two rooms are connected.
     """
     if not is_whole(steps) or steps < 0:
@@ -222,10 +223,8 @@ def tour(
     plan = plan.told_apart(apart)
     if len(plan.connected) < 2:
         raise SimulatorError(f"{plan.name}: expected rooms with doors between them, got none that are connected; take another plan")
-    walk, drawn = (
-        np.random.default_rng([seed, 0]),
-        np.random.default_rng([seed, 1]),
-    )  # so that the noise does not change where the robot goes
+    # Each has numbers of its own, so that the noise does not change where the robot goes.
+    walk, drawn, sighted = (np.random.default_rng([seed, k]) for k in range(3))
     logged: list[Step] = []
     before: Pose | None = None
     for stand, action in _drive(plan, steps, walk):
@@ -233,9 +232,10 @@ def tour(
         moved = None if before is None else between(before, pose)
         if moved is not None and odometry is not None:
             moved = reported(moved, odometry, drawn, scale=scale, bend=bend)
-        star = tuple(sorted(_bearings(plan, stand)))
-        rough = sorted({round(bearing / COARSE) * COARSE % 360 for bearing in star})
-        view = f"{len(star)} door{'s' * (len(star) > 1)}: {' '.join(map(str, rough))}"
+        bearings = _bearings(plan, stand)
+        rough = sorted({round(bearing / COARSE) * COARSE % 360 for bearing in bearings})
+        star = _sighted(plan, stand, apart / 4, sighted)
+        view = f"{len(bearings)} door{'s' * (len(bearings) > 1)}: {' '.join(map(str, rough))}"
         logged.append(Step(view, action, star, moved, truth=_truth(plan, stand, pose)))
         before = pose
     return Trace(tuple(logged), name=f"{plan.name}, {steps} steps, seed {seed}", odometry=odometry)
@@ -290,9 +290,21 @@ def _heading(plan: Plan, stand: Stand) -> float:
 
 
 def _bearings(plan: Plan, stand: Stand) -> tuple[float, ...]:
-    """For each gateway of the room its bearing, in degrees clockwise from ahead. Whoever sees the order of the gateways could tell headings apart by it, so a star is sorted."""
+    """For each gateway of the room its bearing, in degrees clockwise from ahead. Whoever sees the order of the gateways could tell headings apart by it, so stars are sorted."""
     heading = _heading(plan, stand)
     return tuple(round((gateway.bearing - heading) % 360, 3) % 360 for gateway in plan.gateways[stand.room])
+
+
+def _sighted(plan: Plan, stand: Stand, spread: float, chance: np.random.Generator) -> tuple[Sighted, ...]:
+    """The star as the robot sees it: each bearing is off by at most `spread` degrees. Doors through which one path goes on are told to be opposite."""
+    found = plan.gateways[stand.room]
+    off = chance.uniform(-spread, spread, len(found)).tolist()
+    bearings = [round(bearing + wrong, 3) % 360 for bearing, wrong in zip(_bearings(plan, stand), off, strict=True)]
+    order = sorted(range(len(found)), key=lambda k: bearings[k])
+    opposite = [found[k].opposite for k in order]
+    return tuple(
+        Sighted(bearings[k], spread, None if other is None else order.index(other)) for k, other in zip(order, opposite, strict=True)
+    )
 
 
 def _pose(plan: Plan, stand: Stand) -> Pose:

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from math import ceil
 from typing import Any, TypeAlias
 
 from ssh_abduction.errors import TraceError, brief, is_finite, is_whole
@@ -139,7 +140,9 @@ class Star:
         gateways = [self.gateways[k] for k in clockwise]
         return Frame(
             tuple(round(g.bearing) % 360 for g in gateways),
-            tuple(round(g.spread) for g in gateways),
+            tuple(
+                ceil(g.spread + abs(g.bearing - round(g.bearing))) for g in gateways
+            ),  # what rounding the bearing takes away is given back
             tuple(None if g.opposite is None else slot.get(g.opposite) for g in gateways),
         )
 

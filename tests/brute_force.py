@@ -15,6 +15,7 @@ topological theory also needs the kinds of the actions. `one_place` and `one_cou
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from itertools import combinations, permutations, product
@@ -127,6 +128,8 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
             continue
         if geometry and not geometry.allows(labels, None):
             continue
+        if "one_star" in on and not _stars_alike(trace, labels):
+            continue
         dstates = max(labels) + 1
         if theory.level == "causal":
             yield (labels, (None,) * dstates, (None,) * dstates), Counts(dstates, 0, 0, 0)
@@ -162,6 +165,21 @@ def _as_asserted(labels: Labels, places: tuple[int, ...] | None, theory: Theory)
         and all(labels[i] != labels[j] for i, j in different + elsewhere)
         and (places is None or all(places[labels[i]] != places[labels[j]] for i, j in elsewhere))
     )
+
+
+def _stars_alike(trace: Trace, labels: Labels) -> bool:
+    """Whether the stars of each dstate show the same gateways, by trying all ways to pair them."""
+
+    def alike(one: tuple[Gateway, ...], other: tuple[Gateway, ...]) -> bool:
+        if not one:
+            return not any(gateway.open for gateway in other)
+        first, *rest = one
+        near = [k for k, g in enumerate(other) if _off(first.bearing, g.bearing) <= first.spread + g.spread]
+        paired = any(alike(tuple(rest), other[:k] + other[k + 1 :]) for k in near)
+        return paired or (not first.open and alike(tuple(rest), other))
+
+    stars = [step.gateways.gateways if step.gateways else () for step in trace.steps]
+    return all(alike(stars[i], stars[t]) for t in range(len(labels)) for i in range(t) if labels[i] == labels[t])
 
 
 # --- dstates: which steps are equal
@@ -322,7 +340,11 @@ def _readings(step: Step) -> list[tuple[Named, ...]]:
     gateways = star.gateways if star else ()
     found = []
     for seen in product(*[(True,) if g.open else (True, False) for g in gateways]):
-        kept = [(k, round(g.bearing) % 360, round(g.spread)) for k, (g, there) in enumerate(zip(gateways, seen, strict=True)) if there]
+        kept = [
+            (k, round(g.bearing) % 360, math.ceil(g.spread + abs(g.bearing - round(g.bearing))))
+            for k, (g, there) in enumerate(zip(gateways, seen, strict=True))
+            if there
+        ]
         found.append(tuple(sorted(kept, key=lambda g: (gateways[g[0]].bearing + gateways[g[0]].spread) % 360)))
     return found
 
@@ -347,7 +369,12 @@ def _agree(
                 rotations = set()
     if "gateway_frame" in on and not rotations:
         return False
-    if "gateway_turn" in on and t == i + 1 and trace.actions[i].kind == "turn" and not rotations & _turn(trace.actions[i], seen_i):
+    if (
+        "gateway_turn" in on
+        and t == i + 1
+        and trace.actions[i].kind == "turn"
+        and not rotations & _turn(trace.actions[i], seen_i, stars[0])
+    ):
         return False
     facing = {}
     for way, degrees in (("same", 0), ("reverse", 180)):
@@ -373,7 +400,7 @@ def _agree(
     return must and (facing["same"][0] or not same) and (facing["reverse"][0] or not reverse)
 
 
-def _turn(action: Action, seen: tuple[Named, ...]) -> set[int]:
+def _turn(action: Action, seen: tuple[Named, ...], star: tuple[Gateway, ...]) -> set[int]:
     """The rotations that a turn may be."""
     if action.bearing is not None:
         return {r for r in range(360) if _off(r, round(action.bearing)) <= 10}
@@ -385,7 +412,19 @@ def _turn(action: Action, seen: tuple[Named, ...]) -> set[int]:
             return set()
         bearing, spread = beside[action.gateway - 1]
         return {r for r in range(360) if _off(r, bearing) <= spread}
-    return {"around": {180}, "right": set(range(21, 160)), "left": set(range(201, 340))}[str(action.turn)]
+    by_number = {k: (b, d) for k, b, d in seen}
+    behind: set[int] = set()
+    if action.turn == "around":
+        faced = [k for k, b, d in seen if _off(b, 0) <= d][:1]
+        behind = {
+            r
+            for k in faced
+            if star[k].opposite in by_number
+            for b, d in [by_number[star[k].opposite]]
+            for r in range(360)
+            if _off(r, b) <= d
+        }
+    return {"around": {180} | behind, "right": set(range(21, 160)), "left": set(range(201, 340))}[str(action.turn)]
 
 
 def _way_on(seen: tuple[Named, ...], star: tuple[Gateway, ...]) -> tuple[int, int] | None:

@@ -124,7 +124,7 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "next_place": st.booleans(),
         "all_on_paths": st.booleans(),
         "planar": st.booleans(),
-        "star": st.sampled_from(["auto", "none", "pattern", "frame"] if trace.has_stars else ["auto", "none"]),
+        "star": st.sampled_from(["auto", "none", "alike", "pattern", "frame"] if trace.has_stars else ["auto", "none"]),
         "displacement": st.sampled_from(["auto", "none", "use"] if trace.has_displacements else ["auto", "none"]),
         "reject": st.sampled_from([0.001, 0.3]),
         "joint": st.sampled_from([1, 2]),
@@ -146,7 +146,12 @@ def theories(draw: st.DrawFn, trace: Trace, fixed: Collection[str] = ()) -> Theo
     """
     choices: dict[str, Any] = {f.name: draw(choices_of(f.name, trace), label=f.name) for f in fields(Theory) if f.name not in fixed}
     if draw(st.integers(0, 9)) == 9:
-        causal = {"level": "causal", "boundary": "none", "star": "none", "prefer": draw(st.sampled_from([("dstates",), ()]))}
+        causal = {
+            "level": "causal",
+            "boundary": "none",
+            "star": draw(st.sampled_from(["none", "alike"] if trace.has_stars else ["none"])),
+            "prefer": draw(st.sampled_from([("dstates",), ()])),
+        }
         rules = [rules for rules in choices.get("rules", ()) if next(toy for toy in TOYS if toy.rules == rules).causal]
         return Theory(**{**choices, **causal, "rules": rules})
     prefer: tuple[Count, ...] = tuple(name for name in choices["prefer"] if name != "excuses" or choices["boundary"] == "defeasible")

@@ -121,6 +121,7 @@ CORRECT = {
 SPUN = replace(seen("a R a"), steps=tuple(replace(s, displacement=(0, 0, -1.5) if t else None) for t, s in enumerate(seen("a R a"))))
 BROKEN = {
     "one_pose": case(TOPOLOGICAL, SPUN, "0 0", "0"),
+    "one_star": case(Theory.causal().replace(star="alike"), seen("a R a", [(0, 90), (0, 120)]), "0 0", "."),
     "asserted": case(TOPOLOGICAL.replace(different=[(0, 2)]), seen("a R a R a"), "0 0 0", "0"),
     # After turning back, past the place before.
     "planar": case(TOPOLOGICAL.replace(planar=True), seen("a T b T c A d T e"), "0 1 2 3 4", "0:0+ 1:0+ 2:0+ 2:0- 0:0-", "012"),

@@ -222,6 +222,21 @@ def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.Da
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
+@given(traces(), st.data())
+def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
+    """star=alike: solver and checker against the brute force, which tries all ways to pair gateways; the maps of the bare causal theory are judged by it, too."""
+    theory = Theory.causal().replace(star="alike", prefer=data.draw(st.sampled_from([("dstates",), ()])))
+    _, expected = minimal_maps(trace, theory)
+    solution = solve(trace, theory, maps=0, limit=10)
+    assert solution.complete
+    assert {key(ssh_map) for ssh_map in solution.maps} == expected
+    assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
+    _, allowed = minimal_maps(trace, theory.replace(prefer=()))
+    for ssh_map in solve(trace, Theory.causal().replace(prefer=()), maps=20, limit=10).maps:
+        assert (check(trace, ssh_map, theory) == ()) == (key(ssh_map) in allowed)
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(traces(), st.sampled_from(LEFT_OUT[:4]))
 def test_checker_rejects_what_the_brute_force_does_not_find(trace: Trace, left_out: str) -> None:
     """The maps of a theory that lacks an axiom, under the axioms that have it."""

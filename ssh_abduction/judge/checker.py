@@ -26,7 +26,7 @@ from graphlib import CycleError, TopologicalSorter
 from typing import TypeAlias
 
 from ssh_abduction.errors import MapError, brief
-from ssh_abduction.judge.gateways import Clash, Sight, clashes, headings
+from ssh_abduction.judge.gateways import Clash, Sight, clashes, headings, may_show_the_same
 from ssh_abduction.judge.planarity import Edges
 from ssh_abduction.maps import DState, SSHMap
 from ssh_abduction.star import Openings, Star
@@ -895,6 +895,17 @@ def _asserted(m: _Reading) -> Found:
             yield [i, j], f"Steps {i} and {j} are at one place, {min(places, key=str)}, but are said to be {said}."
 
 
+def _star_of_dstate(m: _Reading) -> Found:
+    """The stars seen at a dstate show the same gateways, each in its direction."""
+    seen: dict[int, dict[Star, int]] = {}
+    for t, (label, step) in enumerate(zip(m.map.labels, m.trace.steps, strict=False)):
+        stars, star = seen.setdefault(label, {}), step.gateways or Star(())
+        for other, i in stars.items() if star not in stars else ():
+            if not may_show_the_same(other, star):
+                yield [i, t], f"Steps {i} and {t} are one dstate, {label}, but the gateways seen there are not in the same directions."
+        stars.setdefault(star, t)
+
+
 def _one_pose(m: _Reading) -> Found:
     """A dstate has one pose, a place one position, with which the displacements agree within their covariance."""
     from ssh_abduction.judge.geometry import refused_returns  # loads numpy
@@ -943,6 +954,7 @@ AXIOMS: dict[str, Check] = {
     "gateway_turn": partial(_gateways, "gateway_turn"),
     "gateway_dstate": partial(_gateways, "gateway_dstate"),
     "gateway_path": partial(_gateways, "gateway_path"),
+    "one_star": _star_of_dstate,
     "asserted": _asserted,
     "one_pose": _one_pose,
     "planar": _planar,

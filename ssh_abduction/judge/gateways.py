@@ -173,6 +173,22 @@ def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
     )
 
 
+def may_show_the_same(one: Star, other: Star) -> bool:
+    """Whether two stars may show the same gateways to a robot that has not turned: some pairs in tolerance take in all that are seen in either."""
+    import numpy as np
+    from scipy.optimize import linear_sum_assignment
+
+    bearings, spreads, seen = (
+        [np.array([getattr(g, name) for g in star.gateways], dtype=float) for star in (one, other)]
+        for name in ("bearing", "spread", "open")
+    )
+    seen = [np.nan_to_num(row) for row in seen]  # None, which is not observed, is 0
+    off = np.abs((bearings[0][:, None] - bearings[1] + 180) % 360 - 180)
+    near = off <= spreads[0][:, None] + spreads[1]
+    taken_in = np.where(near, seen[0][:, None] + seen[1], 0)
+    return bool(taken_in[linear_sum_assignment(taken_in, maximize=True)].sum() == sum(row.sum() for row in seen))
+
+
 def _between(a: float, b: float) -> float:
     """The angle between two bearings, 0 to 180 degrees."""
     return min((a - b) % 360, (b - a) % 360)
@@ -192,7 +208,12 @@ def _turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
             _between(r, beside[action.gateway - 1][0]) <= beside[action.gateway - 1][1] for r in found
         )
     if action.turn == "around":
-        return 180 in found
+        behind = [
+            (before.bearings[other], before.spreads[other])
+            for bearing, spread, other in zip(before.bearings, before.spreads, before.opposite, strict=True)
+            if other is not None and _between(bearing, 0) <= spread
+        ][:1]
+        return any(_between(r, bearing) <= spread for r in found for bearing, spread in [(180, 0), *behind])
     sides = (r if action.turn == "right" else 360 - r for r in found)
     return any(2 * SPREAD < side < 180 - 2 * SPREAD for side in sides)
 

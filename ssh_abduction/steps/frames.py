@@ -107,7 +107,9 @@ def _turned_by(action: Action, first: Frame) -> int:
         slot = first.nth(action.turn, action.gateway)
         return 0 if slot is None else _about(first.bearings[slot], first.spreads[slot])
     if action.turn == "around":
-        return 1 << 180
+        faced = next((k for k in range(first.slots) if first.faces(k)), None)
+        behind = None if faced is None else first.opposite[faced]
+        return 1 << 180 | (0 if behind is None else _about(first.bearings[behind], first.spreads[behind]))
     return _between(LEAST_TURN + 1, 179 - LEAST_TURN) if action.turn == "right" else _between(181 + LEAST_TURN, 359 - LEAST_TURN)
 
 

@@ -123,7 +123,7 @@ def _has_frames(theory: Theory) -> bool:
 
 
 def _has_bare_places(theory: Theory) -> bool:
-    return theory.level == "topological" and theory.star == "none" and theory.priorities[:1] == ("dstates",)
+    return theory.level == "topological" and theory.star in ("none", "alike") and theory.priorities[:1] == ("dstates",)
 
 
 def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozenset[str]]:
@@ -174,10 +174,11 @@ SURVIVE_A_CUT = FRAMES | {
     "planar",
     "asserted",
     "asserted same",
+    "one_star",
     "one_pose",
 }
 # Kinds of evidence that say nothing but which steps are not one dstate, or not at one place, and which labels go not together.
-PAIRS_OF_STEPS = ("asserted", "one_pose", "planar")
+PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "planar")
 
 TABLE = (
     Speedup(

@@ -27,9 +27,11 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "level": ("causal", "topological"),
     "boundary": ("none", "strict", "defeasible"),
     "path_order": ("partial", "total"),
-    "star": ("auto", "none", "pattern", "frame", "gateways"),
+    "star": ("auto", "none", "alike", "pattern", "frame", "gateways"),
     "displacement": ("auto", "none", "use"),
 }
+# The readings of stars that take each gateway to be in its direction as far as its spread says.
+IN_TOLERANCE = ("alike", "gateways")
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
 # What is preferred unless a user says so. Displacements tell places apart, so that fewest places are seldom too few; without them it is the other way round (docs/truth.md).
 AUTO: tuple[Count, ...] = ("auto",)
@@ -69,10 +71,10 @@ class Theory:
     path_order       whether the order of the places of a path is partial or total
     next_place       a travel leads to the next place of its path
     all_on_paths     every dstate is along a path, even one that no travel starts or ends at
-    star             the openings seen at a place: none, pattern (agree up to rotation), frame (agree when turned by the
-                     heading, and paths go straight on), gateways (the same in any directions, in tolerance); auto is frame where
-                     the trace has stars, and none elsewhere; frame is gateways where stars or turns do not fit right angles
-                     heading, and paths go straight on); auto is frame where the trace has stars, and none elsewhere
+    star             the openings seen at a place: none, alike (a dstate has one star, in tolerance; nothing is said of places), pattern
+                     (agree up to rotation), frame (agree when turned by the heading, and paths go straight on), gateways (the
+                     same in any directions, in tolerance); auto is frame where the trace has stars, and none elsewhere; frame is
+                     gateways where stars or turns do not fit right angles
     displacement     whether displacements are evidence: none, use; auto uses them where the trace has any
     reject           the probability, at most, that displacements refuse a true map of the trace
     joint            so many returns are tested together, at most: 1 or 2
@@ -94,7 +96,7 @@ class Theory:
     path_order: Literal["partial", "total"] = "total"
     next_place: bool = False
     all_on_paths: bool = False
-    star: Literal["auto", "none", "pattern", "frame", "gateways"] = "auto"
+    star: Literal["auto", "none", "alike", "pattern", "frame", "gateways"] = "auto"
     displacement: Literal["auto", "none", "use"] = "auto"
     reject: float = 0.001
     joint: int = 2
@@ -122,9 +124,9 @@ class Theory:
             object.__setattr__(self, name, _pairs(name, getattr(self, name)))
         self._check_rules()
         if self.level == "causal":
-            for name, value in (("boundary", "none"), ("star", "none")):
-                if getattr(self, name) != value:
-                    raise TheoryError(f"{name}: expected {value} with level=causal, got {getattr(self, name)}; take {CAUSAL}")
+            for name, values in (("boundary", ("none",)), ("star", ("none", "alike"))):
+                if getattr(self, name) not in values:
+                    raise TheoryError(f"{name}: expected {' or '.join(values)} with level=causal, got {getattr(self, name)}; take {CAUSAL}")
             if set(self.prefer) - {"dstates", *AUTO}:
                 raise TheoryError(f"prefer: expected dstates with level=causal, got {', '.join(self.prefer)}; take {CAUSAL}")
         if "auto" in self.prefer and self.prefer != AUTO:
@@ -234,10 +236,10 @@ class Theory:
     def with_frames(self) -> Theory | None:
         """A theory in which places have frames and fewest dstates come first. Its maps, without their headings, are maps of this theory, too.
 
-        None for the causal level, and for stars of any gateways. The trace need not have stars. The maps satisfy all axioms of this theory: their paths are totally
+        None for the causal level, and for stars that are read in tolerance. The trace need not have stars. The maps satisfy all axioms of this theory: their paths are totally
         ordered; the axioms of sides, if there are any, hold without excuses; and stars that agree in a frame are one pattern.
         """
-        if self.level == "causal" or self.star == "gateways":
+        if self.level == "causal" or self.star in IN_TOLERANCE:
             return None
         boundary = "none" if self.boundary == "none" else "strict"
         rest = [count for count in self.priorities if count in ("paths", "places")]
@@ -290,6 +292,8 @@ class Theory:
             return
         if step.star is None:
             raise TraceError(f"{where}: star: expected one, as other steps have stars; add it, or take {_choice('star', 'none')}")
+        if self.star == "alike":
+            return
         if self.star == "gateways":
             if step.gateways and (near := step.gateways.too_near):
                 raise TraceError(

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
+from ssh_abduction.theory.evidence.alike import Alike
 from ssh_abduction.theory.evidence.asserted import Asserted
 from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.planar import Planar
@@ -25,9 +26,22 @@ from ssh_abduction.trace import Trace
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
-KINDS: tuple[type[Evidence], ...] = (Asserted, Displacement, Planar)
+KINDS: tuple[type[Evidence], ...] = (Asserted, Alike, Displacement, Planar)
 
-__all__ = ["KINDS", "NO_PAIRS", "Asserted", "Displacement", "Equality", "Evidence", "Pairs", "Planar", "evidence_of", "pairs_of", "said_by"]
+__all__ = [
+    "KINDS",
+    "NO_PAIRS",
+    "Alike",
+    "Asserted",
+    "Displacement",
+    "Equality",
+    "Evidence",
+    "Pairs",
+    "Planar",
+    "evidence_of",
+    "pairs_of",
+    "said_by",
+]
 
 
 def evidence_of(theory: Theory) -> tuple[Evidence, ...]:

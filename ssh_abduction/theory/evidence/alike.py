@@ -1,0 +1,80 @@
+"""What stars say of dstates alone: a dstate has one star, so steps whose stars are not alike are not one dstate. It needs neither places nor right angles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, ClassVar
+
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.star import Star
+from ssh_abduction.theory.evidence.protocol import Equality
+from ssh_abduction.theory.pairs import Pairs
+from ssh_abduction.trace import Trace
+
+if TYPE_CHECKING:
+    from ssh_abduction.theory.theory import Theory
+
+_Seen = tuple[str | None, Star]  # a view, or None where views say nothing of dstates, and a star
+
+
+@dataclass(frozen=True)
+class Alike:
+    """Stars that are told apart without being turned. Steps of different views are not one dstate anyway, so they are no pairs."""
+
+    name: ClassVar[str] = "alike"
+    axiom: ClassVar[str] = "one_star"
+    has_one_view: bool
+
+    @classmethod
+    def of(cls, theory: Theory) -> Alike:
+        return cls("functional_view" in theory.hard)
+
+    def pairs(self, trace: Trace) -> Pairs:
+        return _pairs(tuple((step.view if self.has_one_view else None, step.gateways or Star(())) for step in trace.steps))
+
+    def facts(self, trace: Trace, start: int, stop: int) -> str:
+        return ""
+
+    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
+        return None
+
+
+@lru_cache(maxsize=8)
+def _pairs(seen: tuple[_Seen, ...]) -> Pairs:
+    """The pairs of steps that see the same view, and stars that are not alike."""
+    steps: dict[str | None, dict[Star, list[int]]] = {}
+    apart: dict[int, frozenset[int]] = {}
+    for t, (view, star) in enumerate(seen):
+        others = steps.setdefault(view, {})
+        if unlike := [i for other, there in others.items() if not are_alike(other, star) for i in there]:
+            apart[t] = frozenset(unlike)
+        others.setdefault(star, []).append(t)
+    return Pairs(apart)
+
+
+@lru_cache(maxsize=2**16)
+def are_alike(one: Star, other: Star) -> bool:
+    """Whether two stars may show the same gateways to a robot that has not turned: each that is seen in one star is a gateway of the other, and no two are one.
+
+    Gateways that were not observed may be there or not. It is enough to pair the gateways seen in one star, and those seen in the other (Mendelsohn & Dulmage 1958).
+    """
+    return _pairable(one, other) and _pairable(other, one)
+
+
+def _pairable(one: Star, other: Star) -> bool:
+    """Whether each gateway that is seen in one star can be paired with a gateway of the other, in tolerance."""
+    partner: dict[int, int] = {}  # for a gateway of the other star, that of the one
+
+    def pair(k: int, tried: set[int]) -> bool:
+        """Find a partner for gateway k, and others for those whose partners it takes."""
+        here = one.gateways[k]
+        for j, there in enumerate(other.gateways):
+            if j not in tried and abs((here.bearing - there.bearing + 180) % 360 - 180) <= here.spread + there.spread:
+                tried.add(j)
+                if j not in partner or pair(partner[j], tried):
+                    partner[j] = k
+                    return True
+        return False
+
+    return all(pair(k, set()) for k, gateway in enumerate(one.gateways) if gateway.open)
