@@ -133,6 +133,33 @@ def moore(states: int, views: int, *, steps: int, seed: int, actions: int = 2) -
     return Walk(Trace.from_steps([f"v{shown[s]}" for s in truth], done, name=f"moore {states}/{views}, seed {seed}"), tuple(truth))
 
 
+def faulty_machine(
+    states: int, views: int, *, steps: int, seed: int, wrong: int = 0, jumps: int = 0, actions: int = 3
+) -> tuple[Walk, tuple[int, ...], tuple[int, ...]]:
+    """A random walk in a random Moore machine, at whose steps some views are wrong; and some actions end anywhere else, and what follows goes on from there.
+
+    Returns the walk, the steps with a wrong view, and those whose action jumped. None of these are the first or last five steps.
+    """
+    walk = moore(states, views, steps=steps, seed=seed, actions=actions)
+    chance = random.Random(f"faults {seed}")
+    links = {(s, a.name): x for (s, x), a in zip(pairwise(walk.truth), walk.trace.actions, strict=True)}
+    shown = dict(zip(walk.truth, walk.trace.views, strict=True))
+    jumped = sorted(chance.sample(range(5, steps - 5), jumps))
+    truth = [walk.truth[0]]
+    for t, action in enumerate(walk.trace.actions):
+        there = links.get((truth[-1], action.name))
+        if t in jumped or there is None:  # what the walk never tried leads nowhere new
+            there = chance.choice([s for s in shown if s != there])
+            links.setdefault((truth[-1], action.name), there)
+        truth.append(there)
+    seen = [shown[s] for s in truth]
+    misread = sorted(chance.sample(range(5, steps - 5), wrong))
+    for t in misread:
+        seen[t] = chance.choice([view for view in sorted(set(shown.values()), key=str) if view != seen[t]])
+    trace = Trace.from_steps(seen, list(walk.trace.actions), name=f"{walk.trace.name}, {wrong} wrong, {jumps} jumps")
+    return Walk(trace, tuple(truth)), tuple(misread), tuple(jumped)
+
+
 def rectangle(circuits: int) -> Walk:
     """The notched rectangle of Kuipers & Beeson (2002), so many times round: eight states, four views."""
     steps = 8 * circuits

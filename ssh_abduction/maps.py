@@ -13,7 +13,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -88,6 +88,33 @@ class Path:
     order: tuple[int, ...]
 
 
+FAULTS = ("misread", "misseen", "slipped")
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What a map disbelieves at a step.
+
+    step      the step
+    kind      misread: the view at this step is not that of its dstate; misseen: its star is not; slipped: the action done there did not do what its
+              name says, so that nothing links this step and the next one
+    seen      the view, None for a star; or the name of the action
+    expected  the view of the dstate; None for stars and actions
+    """
+
+    step: int
+    kind: Literal["misread", "misseen", "slipped"]
+    seen: View | None = None
+    expected: View | None = None
+
+    def __str__(self) -> str:
+        if self.kind == "misread":
+            return f"the view at step {self.step} is misread: {self.seen}, expected {self.expected}"
+        if self.kind == "misseen":
+            return f"the star at step {self.step} is misread"
+        return f"the action at step {self.step} slipped: {self.seen}"
+
+
 @dataclass(frozen=True, slots=True)
 class SSHMap:
     """One explanation of a trace.
@@ -96,6 +123,7 @@ class SSHMap:
     links    (dstate, action name, dstate) for each action tried in each dstate
     excused  pairs of paths that the default side_of_branch is not applied to (boundary=defeasible only)
     fit      how well it agrees with the displacements, where the trace has some and they are used
+    faults   what the map disbelieves, by step, where the theory allows faults
     """
 
     labels: tuple[int, ...]
@@ -105,6 +133,7 @@ class SSHMap:
     paths: tuple[Path, ...] = field(default=(), compare=False)
     excused: tuple[tuple[int, int], ...] = field(default=(), compare=False)
     fit: Fit | None = field(default=None, compare=False)
+    faults: tuple[Fault, ...] = ()
 
     def without_headings(self) -> SSHMap:
         """The same map for a theory in which places have no frames."""
@@ -139,6 +168,7 @@ class SSHMap:
                 for p in sorted(self.paths, key=lambda p: path[p.id])
             ),
             excused=tuple((path.get(h, h), path.get(g, g)) for h, g in self.excused),
+            faults=self.faults,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -162,6 +192,8 @@ class SSHMap:
         }
         if self.excused:
             data["excused"] = [list(pair) for pair in self.excused]
+        if self.faults:
+            data["faults"] = [{k: v for k, v in asdict(fault).items() if v is not None} for fault in self.faults]
         if self.fit:
             data["fit"] = self.fit.to_dict()
             data["poses"] = [[round(x, 4) for x in (pose.x, pose.y, pose.heading)] for pose in self.fit.poses]
@@ -198,7 +230,8 @@ class SSHMap:
                 raise MapError(f"{where}: labels[{i}]: expected the id of a dstate, got {label}; there are {len(dstates)} dstates")
         links = tuple(read.link(x, ids, f"links[{i}]") for i, x in enumerate(read.list(record, "links")))
         excused = tuple(read.pair(x, f"excused[{i}]") for i, x in enumerate(read.list(record, "excused", optional=True)))
-        return cls(labels, dstates, links, places, paths, excused, read.fit(record, len(dstates)))
+        faults = tuple(read.fault(x, len(labels), f"faults[{i}]") for i, x in enumerate(read.list(record, "faults", optional=True)))
+        return cls(labels, dstates, links, places, paths, excused, read.fit(record, len(dstates)), faults)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the map as JSON. Raises MapError."""
@@ -392,6 +425,19 @@ class _Reader:
         if not good or not is_writable(value[1]) or not {value[0], value[2]} <= ids:
             raise self.wrong(name, "[dstate, action name, dstate]", value)
         return value[0], value[1], value[2]
+
+    def fault(self, value: Any, steps: int, name: str) -> Fault:
+        record = self.mapping(value, name)
+        if record.get("kind") not in FAULTS:
+            raise self.wrong(f"{name}.kind", " or ".join(FAULTS), record.get("kind"))
+        step = self.integer(record.get("step"), f"{name}.step")
+        if not 0 <= step < steps:
+            raise self.wrong(f"{name}.step", f"a step from 0 to {steps - 1}", step)
+        for part in ("seen", "expected"):
+            view = record.get(part)
+            if isinstance(view, bool) or not isinstance(view, str | int | None) or (isinstance(view, str) and not is_writable(view)):
+                raise self.wrong(f"{name}.{part}", "a text or an integer", view)
+        return Fault(step, record["kind"], record.get("seen"), record.get("expected"))
 
     def fit(self, record: Mapping[str, Any], dstates: int) -> Fit | None:
         if record.get("fit") is None:

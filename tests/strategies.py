@@ -132,6 +132,8 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "prefer": st.permutations(COUNTS).flatmap(lambda order: st.integers(0, len(order)).map(lambda length: order[:length])),
         "without": _seldom(st.sampled_from(LEFT_OUT).map(lambda name: (name,))),
         "rules": _seldom(st.sampled_from(TOYS).map(lambda toy: (toy.rules,))),
+        "misread": st.just(0.0),  # tests/test_faults.py has tests of its own
+        "slipped": st.just(0.0),
         "same": _seldom(_pairs(len(trace))),
         "different": _pairs(len(trace)),
         "elsewhere": _pairs(len(trace)),

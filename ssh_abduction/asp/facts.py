@@ -14,14 +14,14 @@ from typing import TypeAlias
 
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 
-from ssh_abduction.maps import DState, Path, SSHMap
+from ssh_abduction.maps import FAULTS, DState, Fault, Path, SSHMap
 from ssh_abduction.steps import frames
 from ssh_abduction.steps.chart import Chart, FramedChart
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.evidence import Equality, evidence_of
+from ssh_abduction.theory.evidence import Equality, Pairs, evidence_of
 from ssh_abduction.theory.speedups import TRAVELS_AND_TURNS
-from ssh_abduction.theory.theory import Count, Theory
-from ssh_abduction.trace import Action, Trace
+from ssh_abduction.theory.theory import EXCUSED, Count, Theory
+from ssh_abduction.trace import Action, Trace, View
 
 _COURSE = {"pos": 1, "neg": -1}
 
@@ -39,6 +39,7 @@ def theory_facts(theory: Theory, paths: int) -> str:
     facts += [f"path(1..{paths})."] if theory.level == "topological" else []
     facts += _preferred(theory)
     facts += ["defeasible."] if theory.boundary == "defeasible" else []
+    facts += [f"allowed({kind}). price({kind},{round(10 * price)})." for kind in EXCUSED if (price := getattr(theory, kind))]
     return "\n".join(facts)
 
 
@@ -161,6 +162,7 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
     shape: dict[int, int] = {}
     before: list[tuple[int, int, int]] = []
     excused: list[tuple[int, int]] = []
+    faults: list[tuple[int, str]] = []
     for name, args in map(_atom, model.symbols(shown=True)):
         if name == "is":
             is_at[args[0]] = args[1]
@@ -176,10 +178,12 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
             shape[args[0]] = args[1]
         elif name == "excused":
             excused.append((args[0], args[1]))
+        elif name in FAULTS:
+            faults.append((args[0], name))
     if theory.star == "gateways":
         found = frames.Frames(trace, len(is_at)).frames
         heading = {t: frames.heading(found[shape[p]], found[shape[t]], heading[t]) for t, p in place.items()}
-    return _map(trace, is_at, place, course, heading, before, excused)
+    return _map(trace, is_at, place, course, heading, before, excused, faults)
 
 
 def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
@@ -200,8 +204,10 @@ def _map(
     heading: Mapping[int, int],
     before: Iterable[tuple[int, int, int]],
     excused: Iterable[tuple[int, int]] = (),
+    faults: Sequence[tuple[int, str]] = (),
 ) -> SSHMap:
     """The map of these dstates, places, courses and headings of steps; dstates and places are named by the first step at them."""
+    views = views_of(is_at, trace, faults)
     names = sorted(set(is_at.values()))
     dstate_of = {name: i for i, name in enumerate(names)}
     place_of = {name: i for i, name in enumerate(sorted({place[s] for s in names if s in place}))}
@@ -209,7 +215,7 @@ def _map(
     dstates = tuple(
         DState(
             id=dstate_of[s],
-            view=_view(trace, s),
+            view=views[s],
             place=place_of[place[s]] if s in place else None,
             path=path_of[course[s][0]] if s in course else None,
             direction=course[s][1] if s in course else None,
@@ -222,11 +228,39 @@ def _map(
     return SSHMap(
         labels=labels,
         dstates=dstates,
-        links=links_of(labels, trace),
+        links=links_of(labels, trace, faults),
         places=tuple(place_of.values()),
         paths=_paths(len(path_of), dstates, pairs),
         excused=tuple(sorted((path_of[h], path_of[g]) for h, g in excused if h in path_of and g in path_of)),
+        faults=faults_of(faults, is_at, views, trace),
     )
+
+
+def views_of(labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int, str]] = ()) -> dict[int, View]:
+    """The view of each dstate: that of its first step at which it is not misread.
+
+    labels  the dstate of each step
+    faults  steps and kinds of faults
+    """
+    misread = {t for t, kind in faults if kind == "misread"}
+    views: dict[int, View] = {}
+    for t in sorted(labels):
+        if t not in misread:
+            views.setdefault(labels[t], _view(trace, t))
+    return views
+
+
+def faults_of(faults: Iterable[tuple[int, str]], labels: Mapping[int, int], views: Mapping[int, View], trace: Trace) -> tuple[Fault, ...]:
+    """The faults as a map tells them."""
+    found = []
+    for t, kind in sorted(faults):
+        if kind == "misread":
+            found.append(Fault(t, "misread", _view(trace, t), views[labels[t]]))
+        elif kind == "slipped":
+            found.append(Fault(t, "slipped", trace.actions[t].name))
+        else:
+            found.append(Fault(t, "misseen"))
+    return tuple(found)
 
 
 def name_facts(
@@ -496,6 +530,82 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
             first.append(t)
     found = tuple(number[label] for label in labels)
     return SSHMap(found, tuple(DState(i, _view(trace, t)) for i, t in enumerate(first)), links_of(found, trace))
+
+
+def faulty_map(labels: Sequence[int], trace: Trace, faults: Sequence[tuple[int, str]]) -> SSHMap:
+    """The map of the causal level that these labels make, where some steps are disbelieved; dstates are numbered by first visit."""
+    number: dict[int, int] = {}
+    found = tuple(number.setdefault(label, len(number)) for label in labels)
+    is_at = dict(enumerate(found))
+    views = views_of(is_at, trace, faults)
+    dstates = tuple(DState(i, views[i]) for i in range(len(number)))
+    return SSHMap(found, dstates, links_of(found, trace, faults), faults=faults_of(faults, is_at, views, trace))
+
+
+def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
+    """The names of dstates for faulty.lp, and the view of each: for each view so many, and one more, which is the rest of the view."""
+    first = 0
+    for view, count in names.items():
+        yield from ((name, view) for name in range(first, first + count + 1))
+        first += count + 1
+
+
+def faulty_facts(
+    seen: Sequence[int],
+    actions: Sequence[int],
+    steps: Sequence[int],
+    names: Mapping[int, int],
+    price: Mapping[str, int],
+    pairs: Pairs,
+    forbidden: Sequence[Collection[Equality]] = (),
+) -> tuple[str, dict[int, tuple[int, bool]]]:
+    """These steps of a trace as facts for faulty.lp, and for each name its view, and whether it is the rest.
+
+    steps      ascending
+    names      how many names each view has, beside the rest
+    price      tenths of dstates for each kind of fault; 0 where there are none
+    forbidden  sets of equalities that do not all hold
+    """
+    found: list[str] = [f"action({action})." for action in sorted(set(actions))]
+    known: dict[int, tuple[int, bool]] = {}
+    before: int | None = None
+    for name, view in faulty_names(names):
+        is_first = before is None or known[before][0] != view
+        known[name] = view, False
+        found.append(f"view({name},{view}).")
+        if not is_first:
+            found.append(f"after({before},{name}).")
+        elif before is not None:
+            known[before] = known[before][0], True
+        before = name
+    assert before is not None
+    known[before] = known[before][0], True
+    found += [f"rest({name})." for name, (_, is_rest) in known.items() if is_rest]
+    given = set(steps)
+    for t in steps:
+        found.append(f"node({t},{seen[t]}).")
+        found += [f"misread({t},{price['misread']})."] if price["misread"] else []
+        if t + 1 in given:
+            found.append(f"link({t},{actions[t]},{t + 1}).")
+            found += [f"slipped({t},{price['slipped']})."] if price["slipped"] else []
+        found += [f"excluded({other},{t})." for other in pairs.apart.get(t, ()) if other in given]
+        found += [f"one({other},{t})." for other in pairs.one.get(t, ())]
+    found += [f"next({t},{u})." for t, u in pairwise(steps)]
+    for equalities in forbidden:
+        found.append(f":- {', '.join(f'is({e.first},S{k}), is({e.second},S{k})' for k, e in enumerate(equalities))}.")
+    return "\n".join(found), known
+
+
+def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int]]:
+    """Where each given step is, by the names of faulty.lp, and the steps whose actions slipped."""
+    where: dict[int, int] = {}
+    slips: set[int] = set()
+    for name, args in map(_atom, model.symbols(shown=True)):
+        if name == "is":
+            where[args[0]] = args[1]
+        else:
+            slips.add(args[0])
+    return where, frozenset(slips)
 
 
 def paths_framed_facts(trace: Trace, theory: Theory, chart: FramedChart, forbidden: Sequence[Collection[Equality]] = ()) -> str:
@@ -801,9 +911,11 @@ def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
     return found
 
 
-def links_of(labels: Sequence[int], trace: Trace) -> tuple[tuple[int, str, int], ...]:
-    """The distinct links that a labelling of the trace's first steps makes, sorted."""
-    return tuple(sorted({(s, action.name, x) for (s, x), action in zip(pairwise(labels), trace.actions, strict=False)}))
+def links_of(labels: Sequence[int], trace: Trace, faults: Iterable[tuple[int, str]] = ()) -> tuple[tuple[int, str, int], ...]:
+    """The distinct links that a labelling of the trace's first steps makes, sorted; without those of actions that slipped."""
+    slipped = {t for t, kind in faults if kind == "slipped"}
+    links = enumerate(zip(pairwise(labels), trace.actions, strict=False))
+    return tuple(sorted({(s, action.name, x) for t, ((s, x), action) in links if t not in slipped}))
 
 
 def _view(trace: Trace, step: int) -> str | int:

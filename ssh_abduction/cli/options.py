@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ssh_abduction.errors import MapError, named
-from ssh_abduction.theory.theory import CHOICES, COUNTS, PRESETS, Theory
+from ssh_abduction.theory.theory import CHOICES, COUNTS, EXCUSED, PRESETS, Theory
 from ssh_abduction.trace import Trace
 
 Verbs = Any  # argparse's type for what add_subparsers returns is private
@@ -29,6 +29,8 @@ def add_theory(parser: argparse.ArgumentParser, default: str = "topological, or 
             group.add_argument(f"--{field.name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=said.get(field.name))
     group.add_argument("--reject", type=float, metavar="P", help=said.get("reject"))
     group.add_argument("--joint", type=int, metavar="N", help=said.get("joint"))
+    for name in EXCUSED:
+        group.add_argument(f"--{name}", type=float, metavar="DSTATES", help=said.get(name))
     group.add_argument("--prefer", metavar="COUNTS", help=f"what to minimise, first to last, of {', '.join(COUNTS)}; commas between")
     group.add_argument("--without", metavar="AXIOMS", help="leave these axioms out; commas between")
     group.add_argument(

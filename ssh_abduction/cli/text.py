@@ -28,10 +28,12 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
         return f"unsatisfiable: no map satisfies the axioms; why was not found out in time ({solution.stopped})"
     why = f" ({solution.stopped})" if solution.stopped else ""
     seconds = f"{solution.seconds.total:.2f} s, {solution.prefix} of {solution.steps} steps given to clingo"
-    bound = ", ".join(f"at least {counted(v, k)}" for k, v in solution.bound.to_dict().items())
+    bound = ", ".join(
+        f"at least {counted(v, k)}" if k != "cost" else f"a cost of at least {v:g} dstates" for k, v in solution.bound.to_dict().items()
+    )
     if solution.cost is None:
         return f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; any has {bound or 'no proven bound'}; {seconds}"
-    counts = ", ".join(counted(v, k) for k, v in solution.cost.to_dict().items())
+    counts = ", ".join(counted(v, k) if k != "faults" else f"faults that cost {v:g} dstates" for k, v in solution.cost.to_dict().items())
     if solution.status is Status.FEASIBLE:
         return f"feasible{why}: {counts}, not proven minimal; any map has {bound or 'no proven bound'}; {seconds}"
     found = counted(solution.levels[0].count if solution.levels else count, "minimal maps") + _levels_above(solution)
@@ -65,7 +67,7 @@ def by_displacements(solution: Solution) -> Iterator[str]:
         yield f"weights of the maps by displacements alone: {', '.join(f'{weight:.2g}' for weight in weights)}"
 
 
-def counted(number: int, things: str) -> str:
+def counted(number: float, things: str) -> str:
     """8 dstates, 1 dstate."""
     return f"{number} {things.removesuffix('s') if number == 1 else things}"
 
@@ -80,6 +82,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 def describe(ssh_map: SSHMap) -> str:
     """A map: its paths with their places in order, and its dstates with where they are and where actions lead."""
     parts = []
+    if ssh_map.faults:
+        parts.append(f"  {counted(len(ssh_map.dstates), 'dstates')}, and {'; '.join(printable(str(fault)) for fault in ssh_map.faults)}")
     if ssh_map.paths:
         parts += [f"  path {p.id}: places {' – '.join(map(str, p.order))}" for p in ssh_map.paths]
     if ssh_map.excused:

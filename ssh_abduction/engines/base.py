@@ -24,29 +24,39 @@ AT_ONCE = 8000
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """How many dstates, places, paths and excused pairs of paths a map has."""
+    """How many dstates, places, paths and excused pairs of paths a map has, and how many dstates its faults cost."""
 
     dstates: int
     places: int
     paths: int
     excuses: int = 0
+    faults: float = 0.0
 
     @staticmethod
-    def of(ssh_map: SSHMap) -> Cost:
-        return Cost(len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.excused))
+    def of(ssh_map: SSHMap, theory: Theory | None = None) -> Cost:
+        price = {"misread": theory.misread, "misseen": theory.misread, "slipped": theory.slipped} if theory else {}
+        faults = sum(round(10 * price.get(fault.kind, 0.0)) for fault in ssh_map.faults) / 10
+        return Cost(len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.excused), faults)
+
+    @property
+    def tenths(self) -> int:
+        """Tenths of dstates that the dstates and the faults cost together."""
+        return 10 * self.dstates + round(10 * self.faults)
 
     def preferred_by(self, theory: Theory) -> tuple[int, ...]:
         """The counts that a theory prefers, first to last."""
         return tuple(getattr(self, name) for name in theory.priorities)
 
-    def to_dict(self) -> dict[str, int]:
-        counts = {"dstates": self.dstates, "places": self.places, "paths": self.paths}
-        return {**counts, "excuses": self.excuses} if self.excuses else counts
+    def to_dict(self) -> dict[str, float]:
+        counts: dict[str, float] = {"dstates": self.dstates, "places": self.places, "paths": self.paths}
+        counts |= {"excuses": self.excuses} if self.excuses else {}
+        return {**counts, "faults": self.faults} if self.faults else counts
 
 
 def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> Cost:
     """The counts of a map: those that the theory prefers as clingo counted them, since it may count more than the map can show where axioms are left out."""
-    return replace(Cost.of(ssh_map), **dict(zip(theory.priorities, cost, strict=True)))
+    counted = {name: count for name, count in zip(theory.priorities, cost, strict=True) if name != "tenths"}
+    return replace(Cost.of(ssh_map, theory), **counted)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +69,7 @@ class Found:
     @staticmethod
     def of(ssh_map: SSHMap, theory: Theory) -> Found:
         """A map and its counts, which it shows, as no axiom is left out."""
-        return Found(ssh_map, Cost.of(ssh_map).preferred_by(theory))
+        return Found(ssh_map, Cost.of(ssh_map, theory).preferred_by(theory))
 
 
 @dataclass(frozen=True)

@@ -257,12 +257,14 @@ class _Reading:
 
     def _read(self) -> None:
         labels, with_stars = self.map.labels, self.theory.star in ("pattern", "frame")
+        doubted = {(fault.kind, fault.step) for fault in self.map.faults}  # whether the theory allows these faults is judged apart
         for i, (label, step) in enumerate(zip(labels, self.trace.steps, strict=False)):
             self.first.setdefault(label, i)
-            self.views.setdefault((label, step.view), i)
-            if with_stars and (openings := step.openings) is not None:
+            if ("misread", i) not in doubted:
+                self.views.setdefault((label, step.view), i)
+            if with_stars and ("misseen", i) not in doubted and (openings := step.openings) is not None:
                 self.stars.setdefault((label, openings), i)
-            if step.action is not None and i + 1 < len(labels):
+            if step.action is not None and i + 1 < len(labels) and ("slipped", i) not in doubted:
                 self.links.setdefault((label, step.action.name, labels[i + 1]), i)
 
     @cached_property
@@ -496,10 +498,36 @@ def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | N
 
 
 def _dstates_look_as_seen(m: _Reading) -> Found:
-    """A dstate has the view of the step at which it is first visited. The views of its other steps are judged under functional_view."""
-    for i, s in m.visited:
-        if s.view != m.trace.steps[i].view:
-            yield [i], f"Dstate {s.id} has the view {s.view!r} in the map, but looks like {m.trace.steps[i].view!r} at step {i}."
+    """A dstate has the view of the first step there at which it is not misread. The views of its other steps are judged under functional_view."""
+    shown: dict[int, tuple[View | None, int]] = {}
+    for (label, view), i in m.views.items():
+        shown.setdefault(label, (view, i))
+    for first, s in m.visited:
+        view, i = shown.get(s.id, (None, first))
+        if s.view != view:
+            said = f"looks like {view!r} at step {i}" if s.id in shown else "is misread wherever it is visited"
+            yield [i], f"Dstate {s.id} has the view {s.view!r} in the map, but {said}."
+
+
+def _faults_are_allowed(m: _Reading) -> Found:
+    """Each fault is one that the theory allows, is named once, and is what the trace and the map show."""
+    named: set[tuple[str, int]] = set()
+    for fault in m.map.faults:
+        i, kind = fault.step, fault.kind
+        allowed = {"misread": m.theory.misread, "misseen": m.theory.misread, "slipped": m.theory.slipped}.get(kind, 0)
+        if not allowed or (kind == "misseen" and m.theory.star not in ("pattern", "frame")):
+            yield [], f"The map disbelieves step {i} ({kind}), which the theory does not allow."
+        elif not 0 <= i < min(len(m.trace), len(m.map.labels)) or (kind == "slipped" and m.trace.steps[i].action is None):
+            yield [], f"The map disbelieves step {i} ({kind}), where there is nothing to disbelieve."
+        elif (kind, i) in named:
+            yield [i], f"The map names the fault of step {i} ({kind}) twice."
+        elif kind == "misread":
+            s, seen = m.states.get(m.map.labels[i]), m.trace.steps[i].view
+            if fault.seen != seen or (s and fault.expected != s.view) or seen == fault.expected:
+                yield [i], f"The map says that {fault}, but the trace has {seen!r} there, and the dstate {s.view if s else None!r}."
+        elif kind == "slipped" and fault.seen != (m.trace.steps[i].action or Action("")).name:
+            yield [i], f"The map says that {fault}, but the trace has another action there."
+        named.add((kind, i))
 
 
 def _links_are_those_of_the_trace(m: _Reading) -> Found:
@@ -558,6 +586,7 @@ _COHERENCE: tuple[Check, ...] = (
     _labels_are_dstates,
     _numbered_by_first_visit,
     _dstates_look_as_seen,
+    _faults_are_allowed,
     _links_are_those_of_the_trace,
     _has_what_the_theory_has,
     _excused_are_pairs_of_paths,

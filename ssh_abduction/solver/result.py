@@ -33,16 +33,19 @@ class Bound:
 
     The order of preference proves a bound on the count that goes first; a search that was stopped also counts the steps that cannot be one
     dstate (apart.py). The counts after the first are bounded only among the maps
-    that are minimal in what goes before: those bounds are in Solution.cost once the status is optimal.
+    that are minimal in what goes before: those bounds are in Solution.cost once the status is optimal. Where faults are allowed, `tenths` of dstates bound what
+    dstates and faults cost together.
     """
 
     dstates: int | None = None
     places: int | None = None
     paths: int | None = None
     excuses: int | None = None
+    tenths: int | None = None
 
-    def to_dict(self) -> dict[str, int]:
-        counts = {"dstates": self.dstates, "places": self.places, "paths": self.paths, "excuses": self.excuses}
+    def to_dict(self) -> dict[str, float]:
+        counts: dict[str, float | None] = {"dstates": self.dstates, "places": self.places, "paths": self.paths, "excuses": self.excuses}
+        counts["cost"] = None if self.tenths is None else self.tenths / 10
         return {k: v for k, v in counts.items() if v is not None}
 
 

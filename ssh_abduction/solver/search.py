@@ -182,7 +182,11 @@ class Search:
         """The engine that suits the theory and the length of the trace."""
         if self._may_name():  # loads numpy, which takes longer than to solve a short trace
             from ssh_abduction.engines.causal import CausalEngine
+            from ssh_abduction.engines.faulty import FaultyEngine
             from ssh_abduction.engines.framed import FramedEngine
+
+            if self.theory.has_faults:
+                return FaultyEngine(self._task)
 
             return CausalEngine(self._task) if self.theory.level == "causal" else FramedEngine(self._task)
         most = facts.most_paths(self.trace, self.theory, len(self.trace))

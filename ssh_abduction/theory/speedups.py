@@ -111,7 +111,7 @@ def _keeps_headings(theory: Theory) -> bool:
 
 
 def _is_causal(theory: Theory) -> bool:
-    return theory.level == "causal" and theory.prefer == ("dstates",)
+    return theory.level == "causal" and theory.prefer == ("dstates",) and not theory.has_faults
 
 
 def _has_paths(theory: Theory) -> bool:
@@ -205,6 +205,23 @@ TABLE = (
         _is_causal,
         CAUSAL,
         _kept_by("names", and_also=PAIRS_OF_STEPS),
+    ),
+    Speedup(
+        "named dstates with faults",
+        "names",
+        "Causal theory with faults: give the dstates names, and clingo the steps that a map does not predict.",
+        lambda theory: theory.level == "causal" and theory.has_faults and theory.prefer == ("dstates",),
+        NOTHING,
+        _kept_by(
+            "faulty",
+            and_also=(
+                *(f"{axiom}, excusable" for axiom in CAUSAL),
+                "the field misread",
+                "the field slipped",
+                "asserted same",
+                *PAIRS_OF_STEPS,
+            ),
+        ),
     ),
     Speedup(
         "visits",

@@ -20,7 +20,7 @@ from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.trace import Step, Trace
 
-Count: TypeAlias = Literal["dstates", "paths", "places", "excuses", "auto"]
+Count: TypeAlias = Literal["dstates", "paths", "places", "excuses", "auto", "tenths"]
 Pair: TypeAlias = tuple[int, int]  # of steps
 
 CHOICES: dict[str, tuple[str, ...]] = {
@@ -37,6 +37,23 @@ COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
 AUTO: tuple[Count, ...] = ("auto",)
 PREFERRED: tuple[Count, ...] = ("dstates", "paths", "places")
 WITH_DISPLACEMENTS: tuple[Count, ...] = ("dstates", "places", "paths")
+# What a fault of a kind takes away from the axioms: they may be broken where there is one, so nothing may rely on them.
+EXCUSED = {
+    "misread": {"functional_view", "star_pattern", "star_frame"},
+    "slipped": {
+        "deterministic",
+        "turn_stays",
+        "travel_leaves",
+        "travel_follows_path",
+        "turn_around_reverses",
+        "turn_changes_path",
+        "travel_orders",
+        "next_place",
+        "course_needs_travel",
+        "turn_rotates",
+    },
+}
+DEAREST = 1000.0  # a fault costs so many dstates at most
 # So many returns, at most, may be tested together.
 MOST_JOINT = 2
 # Every trace has fewer steps than this: clingo's numbers have 32 bits, so a pair with a greater step could not even be written as a fact.
@@ -79,6 +96,8 @@ class Theory:
     reject           the probability, at most, that displacements refuse a true map of the trace
     joint            so many returns are tested together, at most: 1 or 2
     returns          how many returns of the trace may be true, among which `reject` is shared; 0 counts them in the trace
+    misread          how many dstates a view, or a star, costs that is not that of its dstate, to a tenth; 0 where none may be
+    slipped          how many dstates an action costs that did not do what its name says, to a tenth; 0 where none may be
     planar           paths meet at places only: the map can be drawn in the plane, with turns right to the right, without a crossing
     prefer           what is minimised, first to last: dstates, paths, places, and with boundary=defeasible excuses, which go first
                      unless they are named; what is not named is not minimised. auto is dstates,places,paths where displacements are used,
@@ -108,6 +127,8 @@ class Theory:
     same: tuple[Pair, ...] = ()
     different: tuple[Pair, ...] = ()
     elsewhere: tuple[Pair, ...] = ()
+    misread: float = 0.0
+    slipped: float = 0.0
 
     def __post_init__(self) -> None:
         for name, values in CHOICES.items():
@@ -131,10 +152,35 @@ class Theory:
                 raise TheoryError(f"prefer: expected dstates with level=causal, got {', '.join(self.prefer)}; take {CAUSAL}")
         if "auto" in self.prefer and self.prefer != AUTO:
             raise TheoryError(f"prefer: expected auto alone, got {', '.join(self.prefer)}; name the counts, or leave it out")
+        if self.has_faults:
+            self._check_faults()
         if "excuses" in self.prefer and self.boundary != "defeasible":
             raise TheoryError(f"prefer: expected no excuses with boundary={self.boundary}; take {_choice('boundary', 'defeasible')}")
 
+    def _check_faults(self) -> None:
+        if self.prefer != AUTO and self.prefer[:1] != ("dstates",):
+            raise TheoryError(
+                f"prefer: expected dstates first where faults are allowed, got {', '.join(self.prefer) or 'nothing'}; faults cost dstates"
+            )
+        if self.star == "gateways":
+            raise TheoryError(
+                f"star: expected no stars of any gateways where faults are allowed, got gateways; take {_choice('star', 'alike')}"
+            )
+        if self.boundary == "defeasible":
+            raise TheoryError(
+                f"boundary: expected no excuses where faults are allowed, got defeasible; take {_choice('boundary', 'strict')}"
+            )
+        if self.planar:
+            raise TheoryError("planar: expected no planarity where faults are allowed; leave it out (--no-planar)")
+
     def _check_numbers(self) -> None:
+        for name in EXCUSED:
+            price = getattr(self, name)
+            if not is_finite(price) or not (price == 0 or 0.1 <= price <= DEAREST):
+                raise TheoryError(
+                    f"{name}: expected a number of dstates from 0.1 to {DEAREST:g}, or 0 for no such faults, got {brief(price)}"
+                )
+            object.__setattr__(self, name, round(float(price), 1))
         if not is_finite(self.reject) or not 0 < self.reject < 1:
             raise TheoryError(
                 f"reject: expected a probability above 0 and below 1, got {brief(self.reject)}; take 0.001, or another small one"
@@ -195,11 +241,18 @@ class Theory:
     def priorities(self) -> tuple[Count, ...]:
         """What is minimised, first to last, with the excuses of boundary=defeasible in their place. With displacement=auto, that of a trace without displacements."""
         prefer = self.prefer
+        if self.has_faults:
+            return ("tenths", *(count for count in (replace(self, misread=0, slipped=0).priorities) if count != "dstates"))
         if prefer == AUTO:
             prefer = ("dstates",) if self.level == "causal" else WITH_DISPLACEMENTS if self.displacement == "use" else PREFERRED
         if self.boundary == "defeasible" and "excuses" not in prefer:
             return ("excuses", *prefer)
         return prefer
+
+    @property
+    def has_faults(self) -> bool:
+        """Whether a map may disbelieve what the trace says of some steps."""
+        return self.misread > 0 or self.slipped > 0
 
     @cached_property
     def axioms(self) -> tuple[str, ...]:
@@ -209,8 +262,9 @@ class Theory:
 
     @cached_property
     def hard(self) -> frozenset[str]:
-        """The axioms that nothing may break: all but the one that boundary=defeasible lets pairs of paths be excused from."""
-        return frozenset(self.axioms) - ({"side_of_branch"} if self.boundary == "defeasible" else set())
+        """The axioms that nothing may break: all but the one that boundary=defeasible lets pairs of paths be excused from, and those that faults may break."""
+        excused = set().union(*(axioms for name, axioms in EXCUSED.items() if getattr(self, name)))
+        return frozenset(self.axioms) - ({"side_of_branch"} if self.boundary == "defeasible" else set()) - excused
 
     @cached_property
     def given_up(self) -> frozenset[str]:
@@ -268,7 +322,8 @@ class Theory:
             mend = f"add them to the steps, or take {_choice('displacement', 'none')}"
             raise TheoryError(f"displacement: expected a trace with displacements for displacement=use, got none; {mend}")
         theory = replace(self, star=star, displacement=displacement)
-        theory = replace(theory, prefer=tuple(count for count in theory.priorities if count in self.prefer or count != "excuses"))
+        counts: list[Count] = ["dstates" if count == "tenths" else count for count in theory.priorities]
+        theory = replace(theory, prefer=tuple(count for count in counts if count in self.prefer or count != "excuses"))
         for i, step in enumerate(trace.steps):
             theory.require(step, trace.at(i))
         return theory._with_returns_of(trace) if displacement == "use" and not self.returns else theory

@@ -1,0 +1,202 @@
+"""Faults: views that are misread, stars that are, and actions that slipped, against brute force, the checker, and machines whose faults are known."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise, product
+
+import pytest
+from brute_force import key, minimal_maps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from instances import faulty_machine
+
+from ssh_abduction import Speedups, Status, Theory, Trace, solve
+from ssh_abduction.cli import main
+from ssh_abduction.errors import MapError, TheoryError
+from ssh_abduction.judge.checker import check
+from ssh_abduction.maps import Fault, SSHMap
+
+Told = tuple[tuple[int, ...], frozenset[tuple[int, str, object]]]  # the labels of the steps, and the faults
+
+
+@st.composite
+def small_traces(draw: st.DrawFn, max_steps: int = 6) -> Trace:
+    steps = draw(st.integers(1, max_steps))
+    seen = draw(st.lists(st.sampled_from("ab"), min_size=steps, max_size=steps))
+    return Trace.from_steps(seen, draw(st.lists(st.sampled_from(["travel", "right"]), min_size=steps - 1, max_size=steps - 1)))
+
+
+def partitions(steps: int) -> Iterator[tuple[int, ...]]:
+    """All labels of so many steps, numbered by first visit."""
+    found: list[tuple[int, ...]] = [()]
+    for _ in range(steps):
+        found = [(*labels, new) for labels in found for new in range(max(labels, default=-1) + 2)]
+    yield from found
+
+
+def cheapest(trace: Trace, misread: int, slipped: int) -> tuple[int | None, set[Told]]:
+    """The least cost in tenths, and all causal maps of it, by trying all labels, all views of dstates and all ends of actions."""
+    best: int | None = None
+    maps: set[Told] = set()
+    for labels in partitions(len(trace)):
+        views, ends = defaultdict(Counter), defaultdict(Counter)
+        for label, view in zip(labels, trace.views, strict=True):
+            views[label][view] += 1
+        for (s, x), action in zip(pairwise(labels), trace.actions, strict=False):
+            ends[s, action.name][x] += 1
+        for shows in product(*(list(views[s]) for s in sorted(views))):
+            for targets in product(*(list(counts) for counts in ends.values())):
+                goes = dict(zip(ends, targets, strict=True))
+                wrong = frozenset((t, "misread", shows[s]) for t, s in enumerate(labels) if trace.views[t] != shows[s])
+                slips = frozenset((t, "slipped", None) for t, a in enumerate(trace.actions) if goes[labels[t], a.name] != labels[t + 1])
+                if (wrong and not misread) or (slips and not slipped):
+                    continue
+                cost = 10 * len(views) + misread * len(wrong) + slipped * len(slips)
+                if best is None or cost < best:
+                    best, maps = cost, set()
+                if cost == best:
+                    maps.add((labels, wrong | slips))
+    return best, maps
+
+
+def told(ssh_map: SSHMap) -> Told:
+    return ssh_map.labels, frozenset((fault.step, fault.kind, fault.expected) for fault in ssh_map.faults)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(small_traces(), st.sampled_from([0.0, 0.4, 1.0]), st.sampled_from([0.0, 0.3, 1.0]), st.booleans())
+def test_causal_maps_with_faults_are_those_of_brute_force(trace: Trace, misread: float, slipped: float, names: bool) -> None:
+    """By names and by the readable encoding. A cost of whole dstates makes ties."""
+    theory = Theory.causal().replace(misread=misread, slipped=slipped)
+    solution = solve(trace, theory, maps=0, speedups=Speedups() if names else Speedups.without("names"))
+    cost, expected = cheapest(trace, round(10 * misread), round(10 * slipped))
+    assert solution.complete
+    assert solution.cost is not None
+    assert solution.cost.tenths == cost
+    assert {told(ssh_map) for ssh_map in solution.maps} == expected
+    assert len(solution.maps) == len(expected)
+    assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(st.data())
+def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) -> None:
+    from unittest.mock import patch
+
+    from ssh_abduction.engines import faulty
+    from ssh_abduction.solver import search
+
+    trace = data.draw(small_traces(max_steps=7))
+    theory = Theory.causal().replace(misread=data.draw(st.sampled_from([0.0, 0.4, 1.0])), slipped=data.draw(st.sampled_from([0.3, 1.0])))
+    with patch.multiple(faulty, AT_FIRST=2, AROUND=0, PLACES=1, NAMES=1, MORE_NAMES=1), patch.object(search, "FEW_STEPS", 0):
+        solution = solve(trace, theory, maps=0)
+    cost, expected = cheapest(trace, round(10 * theory.misread), round(10 * theory.slipped))
+    assert solution.cost is not None
+    assert solution.cost.tenths == cost
+    assert {told(ssh_map) for ssh_map in solution.maps} == expected
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(small_traces(max_steps=4), st.sampled_from([0.4, 1.0]))
+def test_topological_maps_are_those_of_corrected_traces(trace: Trace, misread: float) -> None:
+    """Every way to correct views is tried, and the corrected trace is mapped by the brute force, which knows nothing of faults."""
+    theory = Theory(boundary="none", star="none")
+    best: tuple[int, ...] | None = None
+    expected: set[object] = set()
+    for views in product("ab", repeat=len(trace)):
+        wrong = sum(a != b for a, b in zip(views, trace.views, strict=True))
+        corrected = replace(trace, steps=tuple(replace(step, view=view) for step, view in zip(trace.steps, views, strict=True)))
+        counts, maps = minimal_maps(corrected, theory)
+        if counts is None:
+            continue
+        cost = 10 * counts.dstates + round(10 * misread) * wrong, counts.paths, counts.places
+        seen = {(k, views) for k in maps if all(any(x == s and views[t] == trace.views[t] for t, x in enumerate(k[0])) for s in k[0])}
+        if seen and (best is None or cost < best):
+            best, expected = cost, set()
+        if cost == best:
+            expected |= seen
+    faulty = theory.replace(misread=misread)
+    solution = solve(trace, faulty, maps=0)
+    found = {(key(m), tuple(m.dstates[s].view for s in m.labels)) for m in solution.maps}
+    assert solution.complete
+    assert (solution.cost is None) == (best is None)
+    assert found == expected
+    assert all(check(trace, m, faulty) == () for m in solution.maps)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_faults_of_machines_are_found(seed: int) -> None:
+    walk, wrong, jumps = faulty_machine(6, 5, steps=200, seed=910 + seed, wrong=seed % 2, jumps=1 - seed % 2)
+    theory = Theory.causal().replace(misread=1.5 if wrong else 0.0, slipped=1.5 if jumps else 0.0)
+    solution = solve(walk.trace, theory)
+    assert solution.status is Status.OPTIMAL
+    assert solution.cost is not None
+    assert (solution.cost.dstates, solution.cost.faults) == (6, 1.5)
+    assert any([fault.step for fault in ssh_map.faults] == [*wrong, *jumps] for ssh_map in solution.maps)
+
+
+def test_a_star_that_is_misread_is_excused() -> None:
+    """Out and back along a corridor, with one opening too many seen at one end."""
+    ends = [(1, 0, 0, 0), (0, 0, 1, 0)]
+    stars = [*ends * 4, ends[0]]
+    stars[4] = (1, 1, 0, 0)
+    trace = Trace.from_steps("abcdabcda", ["travel", "around"] * 4, stars=stars)
+    solution = solve(trace, Theory(misread=1.5, star="frame"))
+    assert solution.cost is not None
+    assert (solution.cost.dstates, solution.cost.places, solution.cost.faults) == (4, 2, 1.5)
+    assert solution.maps[0].faults == (Fault(4, "misseen"),)
+    assert check(trace, solution.maps[0], Theory(misread=1.5)) == ()
+    assert {v.axiom for v in check(trace, replace(solution.maps[0], faults=()), Theory(misread=1.5))} == {"star_frame", "star_pattern"}
+
+
+RECTANGLE = Trace.from_steps([f"v{t % 4}" if t != 9 else "v0" for t in range(25)], ["right", "travel"] * 12)
+
+
+def test_the_checker_judges_faults_itself() -> None:
+    theory = Theory.causal().replace(misread=1.5)
+    ssh_map = solve(RECTANGLE, theory).maps[0]
+    assert [str(fault) for fault in ssh_map.faults] == ["the view at step 9 is misread: v0, expected v1"]
+    assert SSHMap.from_dict(ssh_map.to_dict()) == ssh_map
+    assert {v.axiom for v in check(RECTANGLE, ssh_map, Theory.causal())} == {"map_explains_trace"}
+    for faults in (
+        (),
+        (Fault(9, "misread", "v0", "v2"),),
+        (*ssh_map.faults, *ssh_map.faults),
+        (*ssh_map.faults, Fault(3, "slipped", "travel")),
+        (*ssh_map.faults, Fault(99, "misread", "v0", "v1")),
+    ):
+        assert check(RECTANGLE, replace(ssh_map, faults=faults), theory)
+    with pytest.raises(MapError, match=r"faults\[0\].kind: expected misread or misseen or slipped"):
+        SSHMap.from_dict({**ssh_map.to_dict(), "faults": [{"step": 9, "kind": "wrong"}]})
+
+
+@pytest.mark.parametrize(
+    ("choices", "said"),
+    [
+        ({"misread": -1.0}, "misread: expected a number of dstates from 0.1"),
+        ({"slipped": float("nan")}, "slipped: expected a number"),
+        ({"misread": 1.5, "prefer": ("paths",)}, "prefer: expected dstates first"),
+        ({"misread": 1.5, "star": "gateways"}, "star: expected no stars of any gateways"),
+        ({"misread": 1.5, "boundary": "defeasible"}, "boundary: expected no excuses"),
+        ({"misread": 1.5, "planar": True}, "planar: expected no planarity"),
+    ],
+)
+def test_what_faults_do_not_go_with_is_refused(choices: dict[str, object], said: str) -> None:
+    with pytest.raises(TheoryError, match=said):
+        Theory(**choices)  # type: ignore[arg-type]
+
+
+def test_in_the_shell(tmp_path: object, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(str(tmp_path))
+    RECTANGLE.save("trace.jsonl")
+    assert main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--slipped", "3"]) == 0
+    said = capsys.readouterr().out
+    assert "4 dstates, and the view at step 9 is misread: v0, expected v1" in said
+    assert main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["maps"][0]["faults"] == [{"step": 9, "kind": "misread", "seen": "v0", "expected": "v1"}]
+    assert answer["cost"]["faults"] == 1.5
