@@ -13,6 +13,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist
 from sklearn.base import BaseEstimator, ClassifierMixin, clone
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.pipeline import Pipeline
@@ -56,14 +57,24 @@ class PlaceRecognizer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """Share of the neighbours that have each of `classes_`, (n, c)."""
         return np.asarray(self._neighbours().predict_proba(self._images(X)), np.float64)
 
+    def distances(self, X: ArrayLike) -> NDArray[np.float64]:
+        """Euclidean distance from each image to the nearest remembered one of each of `classes_`, (n, c)."""
+        remembered, labels = self.remembered()
+        found = cdist(self._images(X), remembered)
+        return np.column_stack([found[:, labels == label].min(axis=1) for label in self.classes_])
+
+    def remembered(self) -> tuple[NDArray[np.float64], NDArray[Any]]:
+        """The images that were learnt, (m, d), and their labels, (m,)."""
+        held = self._neighbours()
+        return np.asarray(held._fit_X), np.asarray(self.classes_)[np.asarray(held._y)]
+
     def learnt_again(self) -> PlaceRecognizer:
         """A recogniser that learns from scratch the images and labels that this one remembers, and so answers the same.
 
         scikit-learn's compiled search trusts its tables, and tables that were damaged in a file can end the whole process. What is learnt
         again has been checked again. Raises PerceptionError, ValueError or another error of numpy's where the tables are not sound.
         """
-        held = self._neighbours()
-        return PlaceRecognizer(self.n_neighbors).fit(held._fit_X, np.asarray(self.classes_)[np.asarray(held._y)])
+        return PlaceRecognizer(self.n_neighbors).fit(*self.remembered())
 
     def _neighbours(self) -> Any:
         check_is_fitted(self)

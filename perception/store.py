@@ -21,6 +21,7 @@ from sklearn.base import BaseEstimator
 from sklearn.pipeline import Pipeline
 
 from perception.errors import PerceptionError
+from perception.likelihood import ImageLikelihood
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecognizer
 from perception.views import ViewClusterer
@@ -45,6 +46,13 @@ class Stored:
     model: Any
     classes: tuple[Any, ...]
     versions: Mapping[str, str]
+
+    def likelihood(self) -> ImageLikelihood | None:
+        """How probable images are at the places that the model knows; None for a model of another kind, or one that saw no place twice."""
+        try:
+            return ImageLikelihood.of(self.model)
+        except PerceptionError:
+            return None
 
     def labels(self, images: ArrayLike) -> list[int]:
         """The label, a whole number, that the model gives each image, (n, d).

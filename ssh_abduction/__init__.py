@@ -11,8 +11,9 @@ if TYPE_CHECKING:
     from typing import Any
 
     from ssh_abduction.engines.base import Cost
-    from ssh_abduction.errors import MapError, SolverError, SSHError, TheoryError, TraceError
+    from ssh_abduction.errors import LocaliserError, MapError, SolverError, SSHError, TheoryError, TraceError
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
+    from ssh_abduction.localize import Belief, Chances, Localiser
     from ssh_abduction.maps import DState, Fit, Path, Pose, SSHMap
     from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
@@ -27,8 +28,9 @@ if TYPE_CHECKING:
 
 _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
-    "errors": ("MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
+    "errors": ("LocaliserError", "MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
+    "localize": ("Belief", "Chances", "Localiser"),
     "maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
     "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
@@ -45,13 +47,17 @@ _HOMES = {  # module: the names that it exports
 __all__ = [
     "Action",
     "Backbone",
+    "Belief",
     "Bound",
     "Certificate",
+    "Chances",
     "Cost",
     "DState",
     "Evaluation",
     "Fit",
     "Level",
+    "Localiser",
+    "LocaliserError",
     "MapError",
     "MapEvaluation",
     "Odometry",

@@ -26,6 +26,10 @@ class MapError(SSHError):
     """A map, or a file of maps, is malformed."""
 
 
+class LocaliserError(SSHError):
+    """What a localiser is made of, or is asked, does not fit."""
+
+
 class SolverError(SSHError):
     """The solver cannot do what was asked."""
 

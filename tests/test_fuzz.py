@@ -28,7 +28,7 @@ BATCHES = 10  # tests, so that several processes can share the work
 CODES = {0, 1, 2, 10, 20, 30}
 CONTROL = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f]")
 # Verbs that print no program text.
-ANSWER = {"solve", "check", "show", "theory", "cluster", "train", "learning-curve", "evaluate", "recognise", "simulate"}
+ANSWER = {"solve", "check", "show", "theory", "cluster", "train", "learning-curve", "evaluate", "recognise", "simulate", "localize"}
 
 WORLD = {
     "format": "ssh-world",
@@ -53,6 +53,7 @@ COMMANDS: dict[str, list[str]] = {
         "facts FILE",
         "check FILE maps.json",
         "check FILE maps.json --bound",
+        "localize maps.json FILE",
     ],
     "imaged.jsonl": [
         "cluster FILE -o out --k 2",
@@ -60,12 +61,13 @@ COMMANDS: dict[str, list[str]] = {
         "train FILE imaged-maps.json -o out",
         "learning-curve FILE imaged-maps.json --folds 2",
         "recognise recogniser.skops FILE",
+        "localize imaged-maps.json FILE --recogniser recogniser.skops",
     ],
     "indexed.jsonl": ["recognise recogniser.skops FILE", "cluster FILE -o - --k 2"],
     "images.npz": ["recognise recogniser.skops indexed.jsonl", "cluster indexed.jsonl -o out --k 2"],
     "images.npy": ["recognise recogniser.skops npy.jsonl", "train npy.jsonl imaged-maps.json -o out"],
     "maps.json": ["show FILE", "show FILE --map 1", "show FILE --dot", "show FILE --svg", "show FILE --graphml"]
-    + 2 * ["check trace.jsonl FILE", "check trace.jsonl FILE --bound"],
+    + 2 * ["check trace.jsonl FILE", "check trace.jsonl FILE --bound", "localize FILE trace.jsonl --trace trace.jsonl --json"],
     "imaged-maps.json": [
         "train imaged.jsonl FILE -o out",
         "evaluate FILE imaged.jsonl --json",
@@ -75,7 +77,12 @@ COMMANDS: dict[str, list[str]] = {
     "world.json": ["simulate FILE -o out --no-stars"],
     "map.yaml": ["simulate FILE -o out --start=1.5,1.5,0 --route right --reach 0.6 --no-stars"],
     "map.pgm": ["simulate map.yaml -o out --start=1.5,1.5,0 --route right --reach 0.6 --no-stars"],
-    "recogniser.skops": 2 * ["recognise FILE imaged.jsonl", "recognise FILE imaged.jsonl --json"],
+    "recogniser.skops": 2
+    * [
+        "recognise FILE imaged.jsonl",
+        "recognise FILE imaged.jsonl --json",
+        "localize imaged-maps.json imaged.jsonl --recogniser FILE --json",
+    ],
 }
 
 TOKENS = [

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.options import Verbs, read_maps
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.errors import MapError, SSHError, named
+from ssh_abduction.errors import MapError, named
 from ssh_abduction.files import json_line
-from ssh_abduction.maps import maps_of, read_json
+from ssh_abduction.maps import maps_of
 from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.evaluation import evaluate  # which loads scipy
 
-    data = _maps(options.maps)
+    data = read_maps(options.maps)
     maps = maps_of(data, str(options.maps))
     if not maps:
         raise MapError(f"{options.maps}: maps: expected one to evaluate, got none; see the status that solve printed")
@@ -51,23 +51,6 @@ def run(options: argparse.Namespace) -> int:
     print(_truth(found, len(trace)))
     print(table(HEAD, [_row(i, one) for i, one in enumerate(found.maps, 1)]))
     return 0
-
-
-def _maps(file: str) -> Any:
-    """The JSON in a file of maps. Raises MapError."""
-    try:
-        return read_json(file)
-    except MapError:
-        if file == "-" or not _is_trace(file):
-            raise
-        raise MapError(f"{named(file)}: expected a file of maps, got a trace; name the maps first, and then the trace") from None
-
-
-def _is_trace(file: str) -> bool:
-    try:
-        return bool(Trace.load(file))
-    except SSHError:
-        return False
 
 
 def _headline(found: Evaluation, may_be_more: bool) -> str:

@@ -10,7 +10,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.errors import MapError, named
+from ssh_abduction.errors import MapError, SSHError, named
+from ssh_abduction.maps import read_json
 from ssh_abduction.theory.theory import CHOICES, COUNTS, EXCUSED, PRESETS, Theory
 from ssh_abduction.trace import Trace
 
@@ -89,6 +90,23 @@ def check_number(number: int | None, maps: Sequence[object], where: str) -> None
     """Whether there is such a map, counted from 1. Raises MapError."""
     if number is not None and not 1 <= number <= len(maps):
         raise MapError(f"{where}: --map: expected 1 to {len(maps)}, got {number}" if maps else f"{where}: --map: expected a map, got none")
+
+
+def read_maps(file: str) -> Any:
+    """The JSON in a file of maps, of a verb that takes the maps first and then a trace. Raises MapError."""
+    try:
+        return read_json(file)
+    except MapError:
+        if file == "-" or not _is_trace(file):
+            raise
+        raise MapError(f"{named(file)}: expected a file of maps, got a trace; name the maps first, and then the trace") from None
+
+
+def _is_trace(file: str) -> bool:
+    try:
+        return bool(Trace.load(file))
+    except SSHError:
+        return False
 
 
 def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theory:

@@ -30,11 +30,11 @@ def add_parser(verbs: Verbs) -> None:
         parser.add_argument("trace", help="trace file with images")
         parser.add_argument("maps", help="what solve --json printed for this trace, or one saved map")
         parser.add_argument("--map", type=int, metavar="I", help="take the I-th map, from 1 (default: the labels all maps agree on)")
-    text = "Say of each image of a trace at which dstate it was taken."
+    text = "Say of each image of a trace at which dstate it was taken, or that it was taken nowhere that the recogniser knows."
     recognise = verbs.add_parser("recognise", help="recognise dstates from images", description=text)
     recognise.add_argument("recogniser", help="what train wrote")
     recognise.add_argument("trace", help="trace file with images")
-    recognise.add_argument("--json", action="store_true", help="print the labels as a JSON list")
+    recognise.add_argument("--json", action="store_true", help="print the labels as a JSON list, null for nowhere")
     recognise.set_defaults(run=run_recognise)
 
 
@@ -102,11 +102,13 @@ def run_recognise(options: argparse.Namespace) -> int:
     stored = load(options.recogniser)
     images = images_of(Trace.load(options.trace))
     try:
-        labels = stored.labels(images)
+        labels: list[int | None] = [*stored.labels(images)]
+        if (likelihood := stored.likelihood()) is not None:
+            labels = likelihood.labels(images)
     except PerceptionError as error:
         raise PerceptionError(f"{options.recogniser}: {error}") from None
     if options.json:
         print(json.dumps(labels))
     else:
-        print(table(["step", "dstate"], list(enumerate(labels))))
+        print(table(["step", "dstate"], [(step, "nowhere" if label is None else label) for step, label in enumerate(labels)]))
     return 0

@@ -82,6 +82,41 @@ def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None
     _save(figure, path)
 
 
+def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None:
+    """The entropy of each belief, and how probable it is that the robot is nowhere; steps at which it was lost or nowhere are shaded.
+
+    beliefs  as `Belief.to_dict` gives them
+    """
+    pyplot = _pyplot()
+    figure, (upper, lower) = pyplot.subplots(2, 1, figsize=(7, 3.8), sharex=True, height_ratios=(2, 1))
+    steps = np.arange(len(beliefs))
+    for verdict, colour in (("lost", ORANGE), ("nowhere", GREY)):
+        shaded = np.array([belief["verdict"] == verdict for belief in beliefs])
+        for axes in (upper, lower):
+            axes.fill_between(
+                np.repeat(steps, 2) + np.tile([-0.5, 0.5], len(steps)),
+                0,
+                1,
+                where=np.repeat(shaded, 2),
+                color=colour,
+                alpha=0.25,
+                linewidth=0,
+                transform=axes.get_xaxis_transform(),
+                label=verdict if shaded.any() else None,
+            )
+    upper.plot(steps, [belief["entropy"] for belief in beliefs], "o-", color=BLUE, markersize=3, label="entropy")
+    collapses = [step for step, belief in enumerate(beliefs) if belief["collapsed"]]
+    if collapses:
+        upper.plot(
+            collapses, [beliefs[step]["entropy"] for step in collapses], "x", color="black", markersize=7, label="the belief collapsed"
+        )
+    upper.set(ylabel="entropy, bits", ylim=(0, None))
+    upper.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
+    lower.plot(steps, [belief["nowhere"] for belief in beliefs], color=BLUE)
+    lower.set(xlabel="step", ylabel="p(nowhere)", ylim=(0, 1.03), xlim=(-0.5, len(steps) - 0.5))
+    _save(figure, path)
+
+
 def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]]) -> None:
     """The walls, the clutter, the true dstates, and the poses at which images were taken."""
     figure, axes = _pyplot().subplots(figsize=(7, 4))

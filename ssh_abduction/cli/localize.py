@@ -1,0 +1,128 @@
+"""ssh-abduction localize MAPS TRACE: where in a known map was the robot at each step?"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any
+
+from ssh_abduction.cli.options import Verbs, check_number, check_picture, picture_file, read_maps
+from ssh_abduction.cli.text import table
+from ssh_abduction.errors import LocaliserError, MapError, named
+from ssh_abduction.files import json_line
+from ssh_abduction.maps import maps_of
+from ssh_abduction.solver.sharing import stretches
+from ssh_abduction.trace import Trace
+
+if TYPE_CHECKING:
+    from ssh_abduction.localize import Localiser
+
+HEAD = ("step", "action", "seen", "", "dstate", "probability", "nowhere", "entropy", "normaliser")
+CHANCES = ("misread", "slipped", "unmapped", "reentered")
+NOWHERE = "–"
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = (
+        "Where in a known map was the robot at each step of another trace? Markov localisation: a belief over dstates after each step, from a prior that knows nothing. "
+        "A robot that is kidnapped is found again, and one that is nowhere that the map knows is said to be nowhere."
+    )
+    parser = verbs.add_parser("localize", help="where in a known map is the robot?", description=text)
+    parser.add_argument("maps", help="what solve --json printed for the trace that was mapped, or one saved map")
+    parser.add_argument(
+        "other", help="trace of a robot in the mapped world, with the same names of views and actions; - for standard input"
+    )
+    parser.add_argument("--map", type=int, metavar="I", help="take the I-th map, from 1 (default: the first)")
+    parser.add_argument("--trace", metavar="TRACE", help="the trace that was mapped: estimate probabilities from its steps")
+    parser.add_argument("--recogniser", metavar="FILE.skops", help="what train wrote for this map: read images instead of views")
+    chances = parser.add_argument_group("chances", "how likely it is at each step that what the map says does not hold, from 0 to 1")
+    said = {
+        "misread": "what is seen is not of the dstate that the robot is at",
+        "slipped": "the action leads elsewhere: it failed, or the robot was kidnapped",
+        "unmapped": "a robot of which nothing is known is at no dstate of the map",
+        "reentered": "a robot that is at no dstate of the map is at one after its next action",
+    }
+    for name in CHANCES:
+        chances.add_argument(f"--{name}", type=float, metavar="P", help=said[name])
+    chances.add_argument("--zero-one", action="store_true", help="none of these: the map holds without exception")
+    parser.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the entropy of the belief, step by step")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    check_picture(options.plot)
+    localiser = _localiser(options)
+    trace = Trace.load(options.other)
+    beliefs = [belief.to_dict() for belief in localiser.beliefs(trace)]
+    if options.json:
+        head = {"map": options.map or 1, "dstates": len(localiser.ssh_map.dstates), "chances": asdict(localiser.chances)}
+        lines = ",\n".join(json_line({"step": step, **belief}) for step, belief in enumerate(beliefs))
+        print(f'{json_line(head)[:-1]}, "beliefs": [\n{lines}\n]}}')
+    else:
+        print(_headline(beliefs))
+        print(table(HEAD, [_row(step, belief, trace) for step, belief in enumerate(beliefs)]))
+    if options.plot:
+        sys.stdout.flush()  # a picture that fails loses nothing of this
+        from ssh_abduction.reproduce.figures import draw_beliefs
+
+        draw_beliefs(options.plot, beliefs)
+    return 0
+
+
+def _localiser(options: argparse.Namespace) -> Localiser:
+    """The localiser that the options ask for. Raises SSHError that names the file that is wrong."""
+    from ssh_abduction.localize import Chances, Localiser
+
+    maps = maps_of(read_maps(options.maps), str(options.maps))
+    if not maps:
+        raise MapError(f"{named(options.maps)}: maps: expected one to localise in, got none; see the status that solve printed")
+    check_number(options.map, maps, options.maps)
+    if len(maps) > 1 and options.map is None:
+        warnings.warn(f"{named(options.maps)}: the first of {len(maps)} maps is taken; choose one with --map", stacklevel=1)
+    given = {name: getattr(options, name) for name in CHANCES if getattr(options, name) is not None}
+    chances = replace(Chances.none() if options.zero_one else Chances(), **given)
+    recogniser = None
+    if options.recogniser:
+        from perception.store import load
+
+        recogniser = load(options.recogniser).model
+    mapped = Trace.load(options.trace) if options.trace else None
+    try:
+        return Localiser(maps[(options.map or 1) - 1], recogniser, trace=mapped, chances=chances)
+    except MapError as error:
+        raise MapError(f"{named(options.maps)}: {error}") from None
+    except LocaliserError as error:
+        raise LocaliserError(f"{named(options.recogniser)}: {error}") from None
+
+
+def _headline(beliefs: Sequence[Mapping[str, Any]]) -> str:
+    """At which steps the robot was located, unsure, lost and nowhere, and where the belief collapsed."""
+    steps: dict[str, list[int]] = {}
+    for step, belief in enumerate(beliefs):
+        steps.setdefault(belief["verdict"], []).append(step)
+    parts = [f"{verdict} at {_steps(some)}" for verdict, some in steps.items()]
+    if collapses := [step for step, belief in enumerate(beliefs) if belief["collapsed"]]:
+        parts.append(f"the belief collapsed at {_steps(collapses)}")
+    return "; ".join(parts)
+
+
+def _steps(steps: Sequence[int]) -> str:
+    return f"{'step' if len(steps) == 1 else 'steps'} {stretches(steps)}"
+
+
+def _row(step: int, belief: Mapping[str, Any], trace: Trace) -> list[object]:
+    view = trace.steps[step].view
+    return [
+        step,
+        trace.actions[step - 1].name if step else "",
+        "image" if view is None else view,
+        belief["verdict"],
+        NOWHERE if belief["dstate"] is None else belief["dstate"],
+        *(f"{belief[name]:.3f}" for name in ("probability", "nowhere")),
+        f"{belief['entropy']:.2f}",
+        f"{belief['normaliser']:.3g}",
+    ]
