@@ -17,8 +17,10 @@ from hypothesis import strategies as st
 from planar import drive
 
 from ssh_abduction import OnlineMapper, Status, Theory, Trace, TraceError, solve
+from ssh_abduction.cli import main
 from ssh_abduction.judge import gateways as judge
 from ssh_abduction.judge.checker import check
+from ssh_abduction.maps import maps_of, read_json
 from ssh_abduction.solver import prefixes
 from ssh_abduction.star import Frame, Gateway, Star
 from ssh_abduction.steps import frames
@@ -332,6 +334,18 @@ def test_online_maps_general_stars() -> None:
         online, whole = mapper.observe(action, step.view or "", star=step.star), solve(tour.trace.prefix(t + 1))
         assert (online.status, online.cost) == (whole.status, whole.cost)
         assert set(online.maps) == set(whole.maps)
+
+
+def test_maps_with_headings_in_degrees_survive_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What solve prints of a triangle is read by check and show."""
+    tour = drive(planar.triangle(), 0, 1, 9, random.Random(0))
+    tour.trace.save(tmp_path / "t.jsonl")
+    assert main(["solve", str(tmp_path / "t.jsonl"), "--json"]) == 0
+    (tmp_path / "maps.json").write_text(capsys.readouterr().out)
+    assert main(["check", str(tmp_path / "t.jsonl"), str(tmp_path / "maps.json")]) == 0
+    assert main(["show", str(tmp_path / "maps.json"), "--svg", str(tmp_path / "map.svg")]) == 0
+    (ssh_map,) = maps_of(read_json(tmp_path / "maps.json"), "maps.json")
+    assert {s.heading for s in ssh_map.dstates} == {0, 120, 240}
 
 
 def test_a_star_of_quarters_is_read_as_before() -> None:
