@@ -63,7 +63,8 @@ CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
     "gateway_heading": (GATEWAYS, "a R a", "0+120 0+240", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "gateway_turn": (GATEWAYS, "b A a", "0 120", (NONE, 0), ((2, 1, 0), 1)),
     "gateway_dstate": (GATEWAYS, "a R b L c", "0+120 0+240 0+120", (NONE, 0), ((3, 1, 0), 1)),
-    "gateway_path": (GATEWAYS, "a T a A a T a", "180 120 300 300", ((4, 3, 1), 1), ((4, 2, 1), 1)),
+    "gateway_path": (GATEWAYS, "a T a A a T a", "0+60+240 180 0 0+180+300", ((4, 3, 1), 1), ((4, 2, 1), 1)),
+    "gateway_end": (GATEWAYS, "a T b T c", "0 180 180", (NONE, 0), ((3, 3, 1), 1)),
     "one_pose": (PLAIN, "a R a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "path_goes_straight": (FRAME, "a T a A a T a", "back right left left", ((4, 3, 1), 1), ((4, 2, 1), 1)),
 }
