@@ -1,6 +1,6 @@
 """Whether the noise that a simulated trace says of its odometry fits the errors that the displacements have: a table in Markdown.
 
-    python benchmarks/odometry.py [--seeds 4] [--tours 10]
+    python benchmarks/odometry.py [--seeds 4] [--tours 10] [--worlds notched-rectangle taylor-hall]
 
 Errors are counted in the standard deviations that the trace's odometry says, so their mean should be near 0 and their mean square near 1. They are taken
 against the motion between the true poses, and against that between fixed points: the middle of all poses at a place, of all headings at a dstate.
@@ -54,11 +54,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seeds", type=int, default=4, metavar="N", help="drives through each world (default 4)")
     parser.add_argument("--tours", type=int, default=10, metavar="N", help="tours of each drive (default 10)")
+    parser.add_argument("--worlds", nargs="+", default=["notched-rectangle", "taylor-hall"], metavar="NAME", help="which worlds")
     options = parser.parse_args()
     print(
         "| world | action | against | displacements | mean: ahead, left, heading | mean square: ahead, left, heading |\n|---|---|---|---|---|---|"
     )
-    for world in ("notched-rectangle", "taylor-hall"):
+    for world in options.worlds:
         traces = [simulate(World.named(world), options.tours, seed) for seed in range(options.seeds)]
         for kind in ("travel", "turn"):
             for name, poses in (("true poses", true_poses), ("fixed points", fixed_points)):

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from simulator.control import STILL, Driver, Tolerance, act, climb
 from simulator.errors import SimulatorError
+from simulator.junctions import ACTIONS, Pilot
 from simulator.laser import Laser
 from simulator.motion import DIGITS
 from simulator.robot import Body, Report, Robot
 from simulator.world import World
-from ssh_abduction.odometry import Displacement, Odometry
+from ssh_abduction.odometry import Covariance, Displacement, Odometry
 from ssh_abduction.trace import Action, Step, Trace
 
 Array = NDArray[np.float64]
@@ -86,8 +87,15 @@ def simulate(
     log = Log(robot)
     steps = list(_at_dstates(driver, log, world, tours, stars)) if every is None else _evenly(driver, log, world, tours, every)
     steps[-1] = replace(steps[-1], action=None)
-    odometry = noise_model(log.reports, body, tolerance if every is None else None)
+    odometry = _noise(log, world, body, tolerance if every is None else None)
     return Trace(tuple(steps), name=f"{world.name}, {tours} tours, seed {seed}", odometry=odometry)
+
+
+def _noise(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> Odometry:
+    """What the displacements are worth. Where each has a covariance, only the errors that repeat are left to say."""
+    if world.angles == "any" and tolerance is not None:
+        return Odometry(scale=abs(body.scale), bend=abs(body.bend))
+    return noise_model(log.reports, body, tolerance)
 
 
 @dataclass
@@ -138,6 +146,9 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
 
 
 def _at_dstates(driver: Driver, log: Log, world: World, tours: int, stars: bool) -> Iterator[Step]:
+    if world.angles == "any":
+        yield from _at_junctions(driver, log, world, tours, stars)
+        return
     star = Star(world.reach)
     climb(driver)
     if stars:  # look behind, as the half circle does not show it
@@ -164,6 +175,42 @@ def _at_dstates(driver: Driver, log: Log, world: World, tours: int, stars: bool)
             star.act(action)
 
 
+def _at_junctions(driver: Driver, log: Log, world: World, tours: int, stars: bool) -> Iterator[Step]:
+    """The same where streets meet at any angles. How much the robot turned to look around differs from step to step, so each displacement has a covariance of its own."""
+    pilot = Pilot(driver)
+    pilot.begin()
+    done = ""
+    for tour in range(tours):
+        if tour:
+            driver.world = world.arranged(driver.rng)
+        for action in world.route:
+            displacement = log.displacement()
+            yield Step(
+                image=_metres(driver.look(STILL)),
+                action=ACTIONS[action],
+                star=pilot.star() if stars else None,
+                displacement=displacement,
+                covariance=None if displacement is None else _covariance(log.reports[-1], driver.tolerance, done),
+                truth=_truth(world, driver.robot.pose),
+            )
+            pilot.act(action)
+            done = action
+
+
+def _covariance(report: Report, tolerance: Tolerance, action: str) -> Covariance:
+    """The covariance of a displacement between fixed points: that of the odometry, and at both ends what hill-climbing leaves, which is anywhere in its tolerance.
+
+    A turn stays at one point, to a millimetre.
+    """
+    dx, dy, _ = report.displacement
+    near = tolerance.close / math.sqrt(3) if action == "travel" else 0.001
+    left = np.diag([near**2, near**2, tolerance.straight**2 / 3])
+    by_start = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])  # a heading that is off puts the end aside
+    whole = report.covariance + by_start @ left @ by_start.T + left
+    a, b, c = (tuple(float(f"{v:.4g}") for v in row) for row in (whole + whole.T) / 2)
+    return a, b, c  # type: ignore[return-value]
+
+
 def _evenly(driver: Driver, log: Log, world: World, tours: int, every: float) -> list[Step]:
     """Images each `every` metres of odometry. What is at most that far along the route counts as one spot, tour after tour."""
     logged: list[Step] = []
@@ -180,13 +227,14 @@ def _evenly(driver: Driver, log: Log, world: World, tours: int, every: float) ->
             due += every
 
     driver.on_travel = look
-    climb(driver)
+    pilot = Pilot(driver) if world.angles == "any" else None
+    pilot.begin() if pilot else climb(driver)
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
         for action in world.route:
             leg_began = driver.robot.driven
-            act(driver, action)
+            pilot.act(action) if pilot else act(driver, action)
             leg += 1
     return logged
 

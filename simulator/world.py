@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,10 @@ from ssh_abduction.errors import brief, is_finite, named, printable
 from ssh_abduction.files import parse_json, read_at_most
 
 Array = NDArray[np.float64]
+Angles: TypeAlias = Literal["right", "any"]
 FORMAT, VERSION = "ssh-world", 1
+# Radians that a wall may be off a right angle; and of all walls at most this share may be off by more. So a column, or a corner that is cut off, leaves a world right-angled.
+SQUARE, OBLIQUE = math.radians(5), 0.1
 # The smallest `reach` of a world, in metres: a laser reports no range that is smaller.
 NEAREST = 0.01
 # Bytes that a world file may have.
@@ -62,6 +65,7 @@ class World:
     route     the actions of one tour, which ends where it began
     reach     the distance at which the robot follows a wall, in metres: half the width of a corridor
     dstates   the truth, for evaluation only
+    angles    the angles at which streets meet, which choose the control laws: right, or any
     """
 
     name: str
@@ -71,6 +75,7 @@ class World:
     route: tuple[str, ...] = ()
     reach: float = 1.0
     dstates: tuple[TrueDState, ...] = field(default=(), repr=False)
+    angles: Angles = "right"
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -129,7 +134,7 @@ class World:
 
     @classmethod
     def named(cls, name: str) -> World:
-        """A world that comes with the package (notched-rectangle, taylor-hall), or the one in a file: .json, or .yaml for an occupancy map."""
+        """A world that comes with the package (as notched-rectangle or triangle), or the one in a file: .json, or .yaml for an occupancy map."""
         shipped = {path.stem: path for path in (Path(str(files("simulator"))) / "worlds").glob("*.json")}
         if name in shipped:
             return cls.load(shipped[name])
@@ -158,6 +163,16 @@ class World:
         return cls(printable(name), segments, start=(float(middle[0]), float(middle[1]), 0.0))
 
 
+def _are_square(walls: Array) -> bool:
+    """Whether nearly all walls, by their length, are along two directions that are at right angles."""
+    ways = (walls[:, 2] - walls[:, 0]) + 1j * (walls[:, 3] - walls[:, 1])
+    lengths = np.abs(ways)
+    directions = np.angle(ways) * 4  # walls along the axes, either way, have one direction
+    axis = directions[lengths.argmax()]
+    off = np.abs(np.angle(np.exp(1j * (directions - axis)))) / 4
+    return bool(lengths[off > SQUARE].sum() <= OBLIQUE * lengths.sum())
+
+
 class _Reader:
     """Checks the fields of a world, and says which one is wrong."""
 
@@ -171,9 +186,11 @@ class _Reader:
         walls += [self.numbers(s, 4, f"segments[{i}]").reshape(1, 4) for i, s in enumerate(self.list(data, "segments"))]
         if not walls:
             raise self.wrong("polygons", "at least one wall in polygons or segments", [])
+        segments = np.vstack(walls)
         return World(
             name=self.name(data.get("name", printable(Path(self.where).stem))),
-            segments=np.vstack(walls),
+            segments=segments,
+            angles=self.angles(data.get("angles"), segments),
             clutter=tuple(self.clutter(c, f"clutter[{i}]") for i, c in enumerate(self.list(data, "clutter"))),
             start=self.pose(data.get("start", [0, 0, 0]), "start"),
             route=self.route(self.list(data, "route")),
@@ -218,6 +235,12 @@ class _Reader:
         if not is_finite(value) or not NEAREST <= value <= FARTHEST:
             raise self.wrong("reach", f"metres above 0, {NEAREST} to {FARTHEST:,.0f}", value)
         return float(value)
+
+    def angles(self, value: Any, walls: Array) -> Angles:
+        if value not in (None, "right", "any"):
+            raise self.wrong("angles", '"right" or "any"', value)
+        chosen: Angles = value or ("right" if _are_square(walls) else "any")
+        return chosen
 
     def pose(self, value: Any, name: str) -> tuple[float, float, float]:
         x, y, degrees = self.numbers(value, 3, name)

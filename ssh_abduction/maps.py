@@ -31,7 +31,8 @@ class DState:
 
     place, path  None where the theory has none, or the dstate is along no path
     direction    +1 or -1: the way that the dstate faces along its path
-    heading      the slot (0 to 3, clockwise) of the frame of its place that it faces, in theories with star=frame
+    heading      with star=frame the slot (0 to 3, clockwise) of the frame of its place that it faces; with star=gateways degrees (0 to 359), clockwise from the
+                 heading of the first dstate at its place
     """
 
     id: int
@@ -402,8 +403,8 @@ class _Reader:
         if direction not in (None, 1, -1) or (direction is None) != (path is None):
             raise self.wrong(f"{name}.direction", "1 or -1 where there is a path, null elsewhere", direction)
         heading = self.optional(record.get("heading"), f"{name}.heading")
-        if heading not in (None, 0, 1, 2, 3):
-            raise self.wrong(f"{name}.heading", "0 to 3", heading)
+        if heading is not None and not 0 <= heading < 360:
+            raise self.wrong(f"{name}.heading", "a slot, 0 to 3, or degrees, 0 to 359", heading)
         return DState(
             self.integer(record.get("id"), f"{name}.id"),
             view,

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import combinations, permutations, product
 from typing import NamedTuple, TypeAlias
 
@@ -150,7 +151,8 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
                     continue
                 if theory.star == "gateways" and not _gateways_agree(trace, labels, places, courses, on):
                     continue
-                excuses = _least_excuses(places, courses, links, on, defeasible)
+                ends = partial(_gateways_agree, trace, labels, places, courses, on) if "gateway_end" in on else None
+                excuses = _least_excuses(places, courses, links, on, defeasible, ends)
                 if excuses is not None:
                     paths = len({course[0] for course in courses if course})
                     yield (labels, places, courses), Counts(dstates, paths, len(set(places)), excuses)
@@ -309,13 +311,22 @@ def _goes_straight(labels: Labels, places: tuple[int, ...], courses: Courses, he
 # --- gateways: places with any number of them, in any directions, by trying every rotation
 
 
-def _gateways_agree(trace: Trace, labels: Labels, places: tuple[int, ...], courses: Courses, on: Axioms) -> bool:
-    """Whether at each place the gateways of all steps can be named, so that stars agree when turned by whole degrees."""
+def _gateways_agree(
+    trace: Trace, labels: Labels, places: tuple[int, ...], courses: Courses, on: Axioms, orders: dict[int, Order] | None = None
+) -> bool:
+    """Whether at each place the gateways of all steps can be named, so that stars agree when turned by whole degrees, and lead on where paths go on in these orders."""
     at = [places[label] for label in labels]
-    return all(_named([t for t in range(len(labels)) if at[t] == place], trace, labels, courses, on) for place in set(at))
+    onward: list[set[int]] = [set() for _ in labels]
+    for t, label in enumerate(labels):
+        if orders and (course := courses[label]):
+            path, direction = course
+            later, sooner = any(a == at[t] for a, _ in orders[path]), any(b == at[t] for _, b in orders[path])
+            ahead, behind = (later, sooner) if direction == 1 else (sooner, later)
+            onward[t] = {way for way, goes_on in ((0, ahead), (180, behind)) if goes_on}
+    return all(_named([t for t in range(len(labels)) if at[t] == place], trace, labels, courses, on, onward) for place in set(at))
 
 
-def _named(steps: list[int], trace: Trace, labels: Labels, courses: Courses, on: Axioms) -> bool:
+def _named(steps: list[int], trace: Trace, labels: Labels, courses: Courses, on: Axioms, onward: list[set[int]]) -> bool:
     """Whether each of these steps, which are at one place, has a reading of its star: the bearing of each gateway of the place, in a clockwise order that is the same for all."""
 
     def extend(chosen: dict[int, tuple[Named, ...]]) -> bool:
@@ -323,6 +334,9 @@ def _named(steps: list[int], trace: Trace, labels: Labels, courses: Courses, on:
             return True
         step = steps[len(chosen)]
         for reading in _readings(trace.steps[step]):
+            bent = _way_on(reading, Star.of(trace.steps[step].star or ()).gateways)
+            if not bent and not all(any(_off(b, way) <= 2 * d for _, b, d in reading) for way in onward[step]):
+                continue
             for k in range(max(len(reading), 1)) if chosen else (0,):
                 turned = reading[k:] + reading[:k]
                 if all(_agree(i, before, step, turned, trace, labels, courses, on) for i, before in chosen.items()) and extend(
@@ -499,8 +513,15 @@ def _supported(links: frozenset[Link]) -> set[int]:
 # --- orders and sides: whether there are witnesses
 
 
-def _least_excuses(places: tuple[int, ...], courses: Courses, links: frozenset[Link], on: Axioms, defeasible: bool) -> int | None:
-    """The fewest pairs of paths to be excused from B2, under any orders of the paths; None where no orders and excuses will do."""
+def _least_excuses(
+    places: tuple[int, ...],
+    courses: Courses,
+    links: frozenset[Link],
+    on: Axioms,
+    defeasible: bool,
+    ends: Callable[[dict[int, Order]], bool] | None,
+) -> int | None:
+    """The fewest pairs of paths to be excused from B2, under any orders of the paths that `ends` allows; None where no orders and excuses will do."""
     paths = sorted({course[0] for course in courses if course})
     on_path = {h: {p for p, c in zip(places, courses, strict=True) if c and c[0] == h} if "on_path" in on else set() for h in paths}
     travels = [  # (p, q, h, d): a travel led from p to q along path h in direction d
@@ -521,7 +542,8 @@ def _least_excuses(places: tuple[int, ...], courses: Courses, links: frozenset[L
     for excuses in range(len(pairs) + 1):
         for orders in product(*choices):
             for excused in combinations(pairs, excuses):
-                if _sides_allowed(branches, dict(zip(paths, orders, strict=True)), on_path, excused, on):
+                order = dict(zip(paths, orders, strict=True))
+                if _sides_allowed(branches, order, on_path, excused, on) and (ends is None or ends(order)):
                     return excuses
     return None
 

@@ -192,6 +192,7 @@ BROKEN = {
         "01 12",
         also="gateway_frame",
     ),
+    "gateway_end": case(GATEWAYS, seen("a T b T c", [(0,), (180,), (180,)]), "0 1 2", "0:0+^0 1:0+^0 2:0+^0", "012"),
 }
 HIDDEN = ("branch_side", "symmetric_sides", "side_of_branch", "order_asymmetric", "order_transitive")
 AXIOM_NAMES = [a.name for a in encodings.axioms()]

@@ -174,6 +174,7 @@ def test_bad_occupancy_maps(yaml: str, pgm: bytes, message: str, tmp_path: Path)
         ({"segments": [[1, 2, 3]]}, r"segments\[0\]: expected 4 finite numbers"),
         ({"route": ["fly"]}, r"route\[0\]: expected travel, right, left or around"),
         ({"reach": 0}, "reach: expected metres above 0"),
+        ({"angles": 60}, 'angles: expected "right" or "any"'),
         ({"start": [1]}, "start: expected 3 finite numbers"),
         ({"clutter": [3]}, r"clutter\[0\]: expected an object"),
         ({"clutter": [{"polygon": [[0, 0], [1, 0], [1, 1]], "present": 2}]}, r"clutter\[0\].present: expected a probability"),
@@ -186,7 +187,9 @@ def test_bad_worlds_name_the_field(changes: dict[str, Any], message: str, tmp_pa
 
 
 def test_worlds_that_are_not_there(tmp_path: Path) -> None:
-    with pytest.raises(SimulatorError, match="expected one of notched-rectangle, taylor-hall, or a file"):
+    with pytest.raises(
+        SimulatorError, match="expected one of five-ways, notched-rectangle, six-ways, taylor-hall, three-ways, triangle, or a file"
+    ):
         World.named("atlantis")
     with pytest.raises(SimulatorError, match="check the path"):
         World.named(str(tmp_path / "no.json"))

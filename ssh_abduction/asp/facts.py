@@ -90,6 +90,7 @@ def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
     yield from (f"star({t},{found.stars[t]})." for t in range(start, stop))
     yield from (f"looks({star},{x})." for star in dict.fromkeys(found.stars[start:]) for x in found.looks[star])
     yield from (f"slots({x},{max(frame.slots, 1)})." for x, frame in enumerate(found.frames) if x >= known)
+    yield from (f"ends({x},{way})." for x, frame in enumerate(found.frames) if x >= known for way in frames.ends(frame))
     for x, y in product(range(len(found.frames)), repeat=2):
         for shift in found.fits(x, y) if max(x, y) >= known else ():
             yield f"fits({x},{y},{shift})."

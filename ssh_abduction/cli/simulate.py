@@ -8,11 +8,13 @@ from ssh_abduction.cli.options import Verbs, add_output, seed, write
 from ssh_abduction.cli.text import counted
 from ssh_abduction.errors import printable
 
+SHIPPED = ("notched-rectangle", "taylor-hall", "triangle", "three-ways", "five-ways", "six-ways")
+
 
 def add_parser(verbs: Verbs) -> None:
     text = "Drive tours through a world, and log an image, an action and the odometry at each dstate. Views are left to cluster."
     parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
-    parser.add_argument("world", help="notched-rectangle, taylor-hall, a world file (.json), or an occupancy map (.yaml)")
+    parser.add_argument("world", help=f"{', '.join(SHIPPED)}, a world file (.json), or an occupancy map (.yaml)")
     parser.add_argument("--tours", type=int, default=1, metavar="N", help="how often the route is driven (default: 1)")
     parser.add_argument("--seed", type=seed, default=0, help="seed of all noise (default: 0)")
     parser.add_argument("--no-stars", action="store_true", help="do not log the openings that the robot sees at each place")

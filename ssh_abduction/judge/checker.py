@@ -377,7 +377,7 @@ class _Reading:
         for i, (label, step) in enumerate(zip(self.map.labels, self.trace.steps, strict=False)):
             s, star = self.states.get(label), step.gateways or Star(())
             if s and (label, star) not in sights:
-                sights[label, star] = Sight(s, star, i, label not in shown, s.place not in places)
+                sights[label, star] = Sight(s, star, i, label not in shown, s.place not in places, self._onward(s))
                 shown.add(label)
                 places.add(s.place)
             seen.append(sights.get((label, star)))
@@ -386,6 +386,14 @@ class _Reading:
             if a and b and action.kind == "turn" and a.dstate.place == b.dstate.place:
                 turns[a, b].add(action)
         return list(sights.values()), turns
+
+    def _onward(self, s: DState) -> tuple[int, ...]:
+        """Where the path of a dstate goes on to another place: ahead (0), behind (180)."""
+        course = _course(s)
+        if course is None or s.place is None or course[0] not in self.orders:
+            return ()
+        path, direction = course
+        return tuple(towards for towards, way in ((0, direction), (180, -direction)) if self.orders[path].after(s.place, way))
 
     @cached_property
     def clashes(self) -> list[Clash]:
@@ -868,6 +876,9 @@ def _gateways(name: str, m: _Reading) -> Found:
     for clash in m.clashes:
         if name in clash.axioms:
             steps = ", ".join(map(str, clash.steps))
+            if name == "gateway_end" and len(clash.axioms) == 1:
+                yield clash.steps, f"The path goes on from place {clash.place}, but at steps {steps} no gateway is seen that leads on."
+                continue
             yield (
                 clash.steps,
                 f"What is seen at steps {steps} cannot be one place, {clash.place}: the gateways do not agree, however turned.",
@@ -983,6 +994,7 @@ AXIOMS: dict[str, Check] = {
     "gateway_turn": partial(_gateways, "gateway_turn"),
     "gateway_dstate": partial(_gateways, "gateway_dstate"),
     "gateway_path": partial(_gateways, "gateway_path"),
+    "gateway_end": partial(_gateways, "gateway_end"),
     "one_star": _star_of_dstate,
     "asserted": _asserted,
     "one_pose": _one_pose,

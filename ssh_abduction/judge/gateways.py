@@ -21,7 +21,7 @@ from ssh_abduction.maps import DState
 from ssh_abduction.star import SPREAD, Frame, Star
 from ssh_abduction.trace import Action
 
-AXIOMS = ("gateway_frame", "gateway_heading", "gateway_turn", "gateway_dstate", "gateway_path")
+AXIOMS = ("gateway_frame", "gateway_heading", "gateway_turn", "gateway_dstate", "gateway_path", "gateway_end")
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class Sight:
 
     shows  whether the heading of the dstate is that of this sight: the first one there
     first  whether it is the first sight at its place, from whose heading all others there are counted
+    onward  degrees, clockwise from ahead, at which the path of the dstate goes on to another place: 0, 180
     """
 
     dstate: DState
@@ -37,6 +38,7 @@ class Sight:
     step: int
     shows: bool
     first: bool
+    onward: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,8 @@ def _reading(sights: Sequence[Sight], turns: Turns, axioms: Collection[str], as_
             return chosen
         sight = sights[len(chosen)]
         for frame in sight.star.frames:
+            if "gateway_end" in axioms and not all(_leads(frame, towards) for towards in sight.onward):
+                continue
             for shift in range(max(frame.slots, 1)) if chosen else (0,):
                 here = (frame, shift)
                 before = zip([*sights[: len(chosen)], sight], [*chosen, here], strict=True)
@@ -229,6 +233,13 @@ def _ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple
         elif behind == here[0]:
             opposite = True
     return alike, opposite
+
+
+def _leads(frame: Frame, towards: int) -> bool:
+    """Whether some gateway may be that of the robot's path, ahead (0) or behind (180)."""
+    return _passes(frame) is not None or any(
+        _between(bearing, towards) <= 2 * spread for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
+    )
 
 
 def _passes(frame: Frame) -> tuple[int, int] | None:

@@ -81,6 +81,14 @@ def may_turn(action: Action, first: Frame, then: Frame, shift: int) -> bool:
     return bool(rotations(first, then, shift) & _turned_by(action, first))
 
 
+def ends(frame: Frame) -> list[str]:
+    """Where no gateway leads on along the robot's path: ahead, behind. It may be off straight ahead, or straight behind, by twice its spread."""
+    if _way(frame) is not None:
+        return []
+    near = [(bearing, 2 * spread) for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)]
+    return [way for way, towards in (("ahead", 0), ("behind", 180)) if not any(_about(*gateway) >> towards & 1 for gateway in near)]
+
+
 def heading(first: Frame, then: Frame, shift: int) -> int:
     """The heading in what is seen then, in whole degrees clockwise from the heading in what was seen first; 0 where bearings do not tell."""
     return middle(rotations(first, then, shift)) if first.slots == then.slots else 0

@@ -159,7 +159,7 @@ FRAMES = PLACES | {
     "one_dstate_per_heading",
     "path_goes_straight",
 }
-GATEWAYS = frozenset({"gateway_frame", "gateway_heading", "gateway_turn", "gateway_dstate", "gateway_path"})
+GATEWAYS = frozenset({"gateway_frame", "gateway_heading", "gateway_turn", "gateway_dstate", "gateway_path", "gateway_end"})
 NOTHING: frozenset[str] = frozenset()
 # The axioms that a map of a trace still satisfies when it is cut to some first steps, and that speak of nothing but links, observations and pairs of steps.
 SURVIVE_A_CUT = FRAMES | {

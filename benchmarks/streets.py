@@ -1,0 +1,277 @@
+"""Worlds drawn from street maps: walls along both sides of each street, and the true dstates. Run, it simulates such worlds and maps them: a table in Markdown.
+
+    python benchmarks/streets.py [--seeds 20] [--tours 2]
+
+A street map is a graph of networkx whose nodes have a position `at`, as in planar.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cmath
+import json
+import math
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import networkx as nx
+import planar
+
+from perception.images import images_of
+from perception.reciprocal import ReciprocalTransformer
+from perception.views import ViewClusterer
+from simulator.errors import SimulatorError
+from simulator.tours import simulate
+from simulator.world import World
+from ssh_abduction import solve
+from ssh_abduction.evaluation import evaluate
+
+Leg = tuple[object, object]  # a place, and the next one along a street
+STRAIGHT = 20.0  # degrees: two streets that are at most so far from one line are one path
+
+
+def drawn(graph: nx.Graph, reach: float, start: Leg, route: list[str] | None = None, name: str = "streets") -> dict[str, Any]:
+    """The world, as its file has it: streets are 2 `reach` wide, and end `reach` behind a dead end.
+
+    start  the place where the robot starts, and the one that it faces
+    route  None for one along all streets, both ways
+    """
+    ways = {(a, b): _way(graph, a, b) for a, b in graph.edges} | {(b, a): _way(graph, b, a) for a, b in graph.edges}
+    return {
+        "format": "ssh-world",
+        "version": 1,
+        "name": name,
+        "polygons": [[[round(z.real, 4), round(z.imag, 4)] for z in polygon] for polygon in _polygons(graph, ways, reach)],
+        "reach": reach,
+        "start": _pose(graph, start[0], ways[start]),
+        "route": round_trip(graph, start) if route is None else route,
+        "dstates": _dstates(graph, ways),
+    }
+
+
+def _way(graph: nx.Graph, here: object, there: object) -> complex:
+    way: complex = graph.nodes[there]["at"] - graph.nodes[here]["at"]
+    return way / abs(way)
+
+
+def _pose(graph: nx.Graph, place: object, way: complex) -> list[float]:
+    at: complex = graph.nodes[place]["at"]
+    return [round(at.real, 4), round(at.imag, 4), round(math.degrees(cmath.phase(way)), 3)]
+
+
+def _polygons(graph: nx.Graph, ways: dict[Leg, complex], reach: float) -> list[list[complex]]:
+    """The walls: who walks along them has the street at the right, goes to the next place, and there turns to the next street counter-clockwise of where they came from."""
+    left = set(ways)
+    found = []
+    while left:
+        leg = first = min(left, key=str)
+        polygon: list[complex] = []
+        while leg in left:
+            left.remove(leg)
+            here, there = leg
+            at: complex = graph.nodes[there]["at"]
+            back = ways[there, here]
+            others = sorted(graph[there], key=lambda other: cmath.phase(ways[there, other] / back / cmath.rect(1, 1e-9)) % math.tau)
+            onward = others[0]
+            way = ways[there, onward]
+            if onward == here:
+                polygon += [at - reach * back + reach * 1j * back, at - reach * back - reach * 1j * back]
+            else:  # the corner between the street that we came by, and the next one counter-clockwise of it
+                a, b = reach * 1j * back, -reach * 1j * way
+                turn = (back.conjugate() * way).imag
+                along = ((b - a).conjugate() * way).imag / turn if abs(turn) > 1e-6 else 0.0
+                polygon.append(at + a + along * back)
+            leg = (there, onward)
+        assert leg == first
+        found.append(polygon)
+    return found
+
+
+def _dstates(graph: nx.Graph, ways: dict[Leg, complex]) -> list[dict[str, Any]]:
+    """A dstate faces a street, or has it behind where no street is opposite. A path goes on through opposite streets."""
+    course: dict[Leg, tuple[int, int]] = {}
+    for leg in ways:
+        if leg not in course:
+            number = len(set(course.values())) // 2
+            last = _straight_on(ways, _back(leg))[-1]
+            for onward in _straight_on(ways, _back(last)):
+                course[onward], course[_back(onward)] = (number, 1), (number, -1)
+    found = []
+    for (here, to), way in ways.items():
+        path, direction = course[here, to]
+        found.append(
+            {
+                "name": f"{here} to {to}",
+                "place": f"{here}",
+                "path": f"path {path}",
+                "direction": direction,
+                "pose": _pose(graph, here, way),
+            }
+        )
+        if _opposite(ways, (here, to)) is None:
+            found.append(
+                {
+                    "name": f"{here} from {to}",
+                    "place": f"{here}",
+                    "path": f"path {path}",
+                    "direction": -direction,
+                    "pose": _pose(graph, here, -way),
+                }
+            )
+    return found
+
+
+def _back(leg: Leg) -> Leg:
+    return leg[1], leg[0]
+
+
+def _straight_on(ways: dict[Leg, complex], leg: Leg) -> list[Leg]:
+    """A leg, and those that lead straight on from it; once round, if they lead back to it."""
+    legs = [leg]
+    while (onward := _opposite(ways, _back(legs[-1]))) not in (None, leg):
+        assert onward is not None
+        legs.append(onward)
+    return legs
+
+
+def _opposite(ways: dict[Leg, complex], leg: Leg) -> Leg | None:
+    """The leg that leaves a place opposite to another one."""
+    for other, way in ways.items():
+        if other[0] == leg[0] and other != leg and abs(math.degrees(cmath.phase(-way / ways[leg]))) <= STRAIGHT:
+            return other
+    return None
+
+
+def round_trip(graph: nx.Graph, start: Leg) -> list[str]:
+    """Actions that lead along all streets, both ways, and back to the start: always on to the nearest way that is left."""
+    moves = _moves({(a, b): _way(graph, a, b) for edge in graph.edges for a, b in (edge, edge[::-1])})
+    here = first = (*start, True)
+    left = {leg for leg in moves if leg[2]}
+    route: list[str] = []
+    while left or here != first:
+        ways = nx.single_source_shortest_path(moves, here)
+        goal = min(left, key=lambda leg: (len(ways[leg]), str(leg))) if left else first
+        for a, b in zip(ways[goal], ways[goal][1:], strict=False):
+            route.append(moves.edges[a, b]["action"])
+            left -= {a} if moves.edges[a, b]["action"] == "travel" else set()
+        here = goal
+        if left:
+            route.append("travel")
+            left.discard(here)
+            here = next(b for _, b, action in moves.edges(here, data="action") if action == "travel")
+    return route
+
+
+def _moves(ways: dict[Leg, complex]) -> nx.DiGraph:
+    """The dstates, (place, street, whether it is ahead), and the actions that lead from one to another."""
+    moves: nx.DiGraph = nx.DiGraph()
+    facing = {(*leg, True): way for leg, way in ways.items()}
+    facing |= {(*leg, False): -way for leg, way in ways.items() if _opposite(ways, leg) is None}
+    for state, way in facing.items():
+        here, there, ahead = state
+
+        def clockwise(other: tuple[object, object, bool], way: complex = way) -> float:
+            return -math.degrees(cmath.phase(facing[other] / way)) % 360
+
+        others = [other for other in facing if other[0] == here and other != state]
+        streets = [other for other in others if other[2]]
+        for side, order in (("right", clockwise), ("left", lambda other: -clockwise(other) % 360)):
+            if beside := [other for other in streets if STRAIGHT < order(other) < 180 - STRAIGHT]:
+                moves.add_edge(state, min(beside, key=order), action=side)
+        if others:
+            moves.add_edge(state, min(others, key=lambda other: abs(clockwise(other) - 180)), action="around")
+        if ahead:
+            on = _opposite(ways, (there, here))
+            moves.add_edge(state, (there, here, False) if on is None else (*on, True), action="travel")
+    return moves
+
+
+def turning(*turns: float) -> nx.Graph:
+    """Streets one after another, each turned to the left against the one before by so many degrees."""
+    at, heading, found = 0j, 10.0, {0: 0j}
+    for k, turn in enumerate((0.0, *turns), 1):
+        heading += turn
+        at += cmath.rect(5.5 + 0.5 * k, math.radians(heading))
+        found[k] = at
+    return planar.world(found, [(k, k + 1) for k in range(len(turns) + 1)])  # type: ignore[arg-type]
+
+
+def hub(*directions: float) -> nx.Graph:
+    """A hub, and dead ends in these directions, in degrees; each somewhat farther than the one before."""
+    graph = planar.junction(*directions)
+    for k in range(len(directions)):
+        graph.nodes[k]["at"] *= 6 + 0.7 * k
+    return graph
+
+
+def ring(graph: nx.Graph, size: float) -> nx.Graph:
+    """A street map, so many times as large."""
+    for place in graph:
+        graph.nodes[place]["at"] *= size
+    return graph
+
+
+MAPS: dict[str, tuple[nx.Graph, Leg]] = {
+    "bends of 150 degrees": (turning(30, 30), (0, 1)),
+    "bends of 135 and 90 degrees": (turning(45, -90), (0, 1)),
+    "bends of 120 degrees": (turning(60, -60), (0, 1)),
+    "a corner of 60 degrees": (turning(120), (0, 1)),
+    "a corner of 45 degrees": (turning(135), (0, 1)),
+    "a ring of six bends of 120 degrees": (ring(planar.hexagon(), 6), (0, 1)),
+    "three streets at 90 degrees": (hub(0, 90, 180), ("hub", 0)),
+    "three streets, one at 45 degrees": (hub(0, 45, 180), ("hub", 0)),
+    "three streets at 120 degrees": (hub(90, 210, 330), ("hub", 0)),
+    "four streets at 90 degrees": (hub(0, 90, 180, 270), ("hub", 0)),
+    "five streets at odd angles": (hub(0, 50, 135, 180, 270), ("hub", 0)),
+    "seven streets": (hub(*(360 / 7 * k for k in range(7))), ("hub", 0)),
+}
+
+
+def _worlds(reach: float) -> Iterator[World]:
+    yield from (World.named(name) for name in ("triangle", "three-ways", "five-ways", "six-ways"))
+    with tempfile.TemporaryDirectory() as folder:
+        for name, (graph, start) in MAPS.items():
+            path = Path(folder) / "world.json"
+            path.write_text(json.dumps({**drawn(graph, reach, start, name=name), "angles": "any"}))
+            yield World.load(path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="drives through each world (default 20)")
+    parser.add_argument("--tours", type=int, default=2, metavar="N", help="tours of each drive (default 2)")
+    parser.add_argument("--reach", type=float, default=0.8, metavar="M", help="half the width of the streets that are drawn (default 0.8)")
+    options = parser.parse_args()
+    print(
+        "| world | steps | driven | dstates and places right | and paths | the only minimal map | seconds: simulate, solve |\n|---|---|---|---|---|---|---|"
+    )
+    for world in _worlds(options.reach):
+        driven = places = paths = alone = 0
+        simulating = solving = 0.0
+        for seed in range(1000, 1000 + options.seeds):
+            began = process_time()
+            try:
+                run = simulate(world, options.tours, seed)
+            except SimulatorError:
+                continue
+            simulated = process_time()
+            views = ViewClusterer(random_state=0).fit(ReciprocalTransformer().fit_transform(images_of(run))).labels_
+            trace = run.with_views(views.tolist())
+            clustered = process_time()
+            solution = solve(trace, maps=0, limit=60)
+            found = evaluate(solution.maps, trace) if solution.maps else None
+            driven += 1
+            places += bool(found and all(m.dstates_right and m.places_right for m in found.maps))
+            paths += bool(found and found.rank)
+            alone += bool(found and found.rank and solution.complete and len(solution.maps) == 1)
+            simulating, solving = simulating + simulated - began, solving + process_time() - clustered
+        seconds = f"{simulating / max(driven, 1):.1f}, {solving / max(driven, 1):.1f}"
+        steps = options.tours * len(world.route)
+        print(f"| {world.name} | {steps} | {driven} of {options.seeds} | {places} | {paths} | {alone} | {seconds} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

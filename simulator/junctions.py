@@ -1,0 +1,185 @@
+"""Control laws for streets that meet at any angles. Each of them sees laser images and odometry, and none knows the true pose.
+
+The robot follows the midline of a street until a wall is ahead or a side is open. There it looks around, and climbs to the fixed point of the place, where the midlines of its streets meet. From the
+panorama there it has a model of the place, in which its gateways are the streets that lead away. A turn goes to the next gateway at its side, and a turn around to the opposite heading; the robot
+knows how it is turned by comparing what it sees with the panorama.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from simulator.control import LONGEST_TRAVEL, STILL, STRIDE, TRIES, Driver
+from simulator.errors import SimulatorError
+from simulator.laser import BEARINGS
+from simulator.surroundings import STRAIGHT, Array, Panorama, Place, Street, apart, compass, points_of, streets_of, walls_of
+from ssh_abduction.trace import Action
+
+# Radians that the robot turns between two images.
+TURN = math.radians(15)
+# In reaches: how far the robot drives before it heeds what may be a place, at which distance a wall ahead stops it, and how far off a wall at its side is where the side is open.
+LEAVE, AHEAD, OPEN = 2.2, 1.6, 1.35
+SIDES = {"left": 1, "right": -1}
+ACTIONS = {
+    "travel": Action.of("travel"),
+    "around": Action.of("around"),
+    **{side: Action.of({"name": side, "kind": "turn", "turn": side, "gateway": 1}) for side in SIDES},
+}
+
+
+@dataclass
+class Here:
+    """The place where the robot is: its panorama, what that shows, and how the robot is turned in it, in radians."""
+
+    ranges: Array
+    place: Place
+    heading: float = 0.0
+
+
+class Pilot:
+    """Does the actions of a route with the control laws for any angles."""
+
+    here: Here
+
+    def __init__(self, driver: Driver) -> None:
+        self.driver = driver
+        self.reach = driver.world.reach
+
+    def begin(self) -> None:
+        """Climb to the dstate that is nearest to where the robot stands. Raises SimulatorError where that is no place."""
+        if not self._climb():
+            raise self._error("start", "a place, where streets meet or end", "a street that goes straight on", "move the start")
+
+    def act(self, action: str) -> None:
+        """Do an action of a route. Raises SimulatorError where it cannot be done."""
+        if action == "travel":
+            self._travel()
+        elif action == "around":
+            self._face(self.here.place.heading(self.here.heading + math.pi))
+        else:
+            turn = self.here.place.beside(self.here.heading, SIDES[action])
+            if turn is None:
+                raise self._error(action, f"a street to the {action}", "none before straight behind", "take around, or another turn")
+            self._face(self.here.heading + turn)
+
+    def star(self) -> tuple[float, ...]:
+        """The bearings of the gateways, in degrees clockwise from straight ahead."""
+        bearings = (round(math.degrees(self.here.heading - street.bearing) % 360, 1) % 360 for street in self.here.place.streets)
+        return tuple(sorted(bearings))
+
+    def _travel(self) -> None:
+        if not self.here.place.faces(self.here.heading):
+            raise self._error("travel", "a free way ahead", "a wall", "change the route")
+        began = self.driver.robot.driven
+        heed = began + LEAVE * self.reach
+        while True:
+            width = self._follow(began, heed)
+            for way in (
+                (-width / 2, -width / 4, width / 2) if width else (0.0,)
+            ):  # a street that leaves at an acute angle is not seen from everywhere
+                self._straight(way)
+                if self._climb():
+                    return
+            heed = self.driver.robot.driven + self.reach
+
+    def _follow(self, began: float, heed: float) -> float:
+        """Follow the midline until a wall is ahead, or to the end of where a side is open; not before the robot has driven so far. For how many metres a side was open."""
+        robot, reach = self.driver.robot, self.reach
+        course = robot.odometry[2]  # of the street, by odometry
+        closed, opened = False, None  # whether there were walls at both sides, and where that ended
+        while robot.driven - began <= LONGEST_TRAVEL:
+            image = self.driver.look()
+            points, beams = points_of(image, BEARINGS, self.driver.laser.reach)
+            if robot.driven > heed:
+                ahead = points.real[np.abs(points.imag) < 0.3 * reach]
+                if len(ahead) and np.median(ahead) < AHEAD * reach:
+                    return 0.0
+                if not any(_is_open(image, side, reach) for side in SIDES.values()):
+                    if opened is not None:
+                        return robot.driven - opened
+                    closed = True
+                elif closed and opened is None:
+                    opened = robot.driven
+            streets = streets_of(walls_of(points, beams), points, reach, 0.0)
+            course_off = course - robot.odometry[2]
+            street = min(streets, key=lambda street: apart(street.bearing, course_off), default=None)
+            if street is not None and apart(street.bearing, course_off) <= STRAIGHT:
+                course = robot.odometry[2] + street.bearing
+                self.driver.go(STRIDE, _steer(street))
+            else:
+                self.driver.go(STRIDE)
+            if self.driver.on_travel is not None:
+                self.driver.on_travel(self.driver)
+        raise self._error("travel", f"a place within {LONGEST_TRAVEL:.0f} m", "none", "close the street")
+
+    def _straight(self, way: float) -> None:
+        """Drive straight ahead, or back."""
+        strides = math.ceil(abs(way) / STRIDE)
+        for _ in range(strides):
+            self.driver.go(way / strides)
+
+    def _climb(self) -> bool:
+        """Climb to the fixed point of the place here, and face the way that the robot came, straight on. False if this is no place."""
+        came = self.driver.robot.odometry[2]
+        for _ in range(TRIES):
+            straight_on = came - self.driver.robot.odometry[2]
+            self.here = self._look_around()
+            place = self.here.place
+            if not place.streets:
+                raise self._error("place", f"a street, about {2 * self.reach:g} m wide", "none", "give another reach")
+            if place.fixed is None or abs(place.fixed) <= self.driver.tolerance.close:
+                break
+            self._go(place.fixed)
+        self._face(place.heading(straight_on))
+        return place.fixed is not None
+
+    def _go(self, goal: complex) -> None:
+        """Go to a point that is given in the panorama, at most `reach` metres, forward or back."""
+        forward = cmath.phase(goal) if abs(cmath.phase(goal)) <= math.pi / 2 else cmath.phase(-goal)
+        self._face(forward)
+        self._straight(min(abs(goal), self.reach) * (1 if forward == cmath.phase(goal) else -1))
+
+    def _look_around(self) -> Here:
+        """Turn once all around. The panorama is in the frame of the robot at the end."""
+        driver = self.driver
+        panorama = Panorama(driver.look())
+        for _ in range(round(math.tau / TURN)):
+            turned = self._turn(TURN)
+            panorama.add(driver.look(), turned)
+        ranges = panorama.ranges
+        return Here(ranges, Place.of(ranges, self.reach, driver.laser.reach), panorama.headings[-1])
+
+    def _face(self, heading: float) -> None:
+        """Turn on the spot to a heading, which is one in the panorama."""
+        for _ in range(TRIES):
+            turn = math.remainder(heading - self.here.heading, math.tau)
+            if abs(turn) <= self.driver.tolerance.straight:
+                return
+            strides = math.ceil(abs(turn) / TURN)
+            turned = sum(self._turn(turn / strides) for _ in range(strides))
+            self.here.heading = compass(self.here.ranges, self.driver.look(STILL), self.here.heading + turned, turned)
+
+    def _turn(self, turn: float) -> float:
+        """Turn once, and say how far by odometry."""
+        before = self.driver.robot.odometry[2]
+        self.driver.go(0.0, turn)
+        return math.remainder(self.driver.robot.odometry[2] - before, math.tau)
+
+    def _error(self, what: str, expected: str, got: str, mend: str) -> SimulatorError:
+        x, y, _ = self.driver.robot.pose
+        return SimulatorError(f"{self.driver.world.name}: {what} at ({x:.2f}, {y:.2f}): expected {expected}, got {got}; {mend}")
+
+
+def _is_open(image: Array, side: int, reach: float) -> bool:
+    """Whether the wall at a side (1 left, -1 right) has ended: between 75 and 90 degrees what is there is farther off than a wall of the street."""
+    beams = image[-15:] * np.sin(BEARINGS[-15:]) if side > 0 else image[:15] * np.sin(-BEARINGS[:15])
+    return bool(np.median(beams) > OPEN * reach)
+
+
+def _steer(street: Street) -> float:
+    """Radians to turn on the next stride, so that the robot comes to the midline and then goes along it."""
+    return street.bearing - math.atan(1.5 * float(np.clip(street.offset, -0.5, 0.5)))

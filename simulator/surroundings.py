@@ -1,0 +1,261 @@
+"""What a robot makes of laser images where streets meet at any angles: walls, streets, and the panorama around a place. Nothing here knows the true pose.
+
+A wall is a straight stretch of the points of an image. A street is what lies between two walls that face each other, about twice `reach` apart. The fixed point of a place is where the
+midlines of its streets meet; at a dead end it is `reach` before the wall.
+
+An image shows half a circle. As a robot that turns on the spot sees the same walls turned, images overlap, and the turn that makes them agree best is the one that it has done: a visual compass.
+So a panorama of the whole circle comes of images that are taken while the robot turns.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.laser import BEARINGS
+
+Array = NDArray[np.float64]
+# Metres that points of a wall may be off its line. That is six times the noise of the laser.
+THICK = 0.03
+# Metres that a wall has to be long: what is shorter is clutter.
+LONG = 0.4
+# Beams with nothing between them end a wall.
+GAP = 3
+# Share of a turn by which odometry is trusted to be off at most.
+OFF = 0.15
+# Radians, the bearings of a panorama.
+AROUND: Array = np.radians(np.arange(360.0))
+# Radians by which two walls of a street may fail to be parallel.
+PARALLEL = math.radians(8)
+# A street is as wide as this, in reaches. Its walls have to go on for so many reaches, or it is a recess of the place.
+WIDTHS = (1.2, 3.0)
+FAR = 2.0
+# Two directions that differ by at most so many radians are one: a street that bends by less goes straight on.
+STRAIGHT = math.radians(20)
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A straight wall, from the end that is seen first to the one that is seen last, counter-clockwise: so its inside is at its left.
+
+    Points and directions of the plane are complex numbers: metres ahead of the robot, and metres to its left.
+    """
+
+    start: complex
+    end: complex
+
+    @property
+    def way(self) -> complex:
+        """From the start to the end."""
+        return self.end - self.start
+
+
+@dataclass(frozen=True)
+class Street:
+    """A street that leads away from the robot.
+
+    bearing  radians, counter-clockwise from straight ahead
+    middle   the point of its midline that is nearest to the robot
+    length   metres of it between two walls, as far as the robot sees them
+    """
+
+    bearing: float
+    middle: complex
+    length: float
+
+    @property
+    def offset(self) -> float:
+        """Metres that the robot is left of the midline, where it looks along the street."""
+        return -(self.middle * cmath.rect(1, -self.bearing)).imag
+
+
+def points_of(ranges: Array, bearings: Array, farthest: float) -> tuple[NDArray[np.complex128], NDArray[np.intp]]:
+    """The points that an image shows, and the numbers of their beams. What is `farthest` or farther was not seen."""
+    seen = np.flatnonzero(ranges < farthest - 0.02)
+    return ranges[seen] * np.exp(1j * bearings[seen]), seen
+
+
+def walls_of(points: NDArray[np.complex128], beams: NDArray[np.intp]) -> list[Wall]:
+    """The walls on which points lie that are given counter-clockwise."""
+    breaks = np.flatnonzero(np.diff(beams) > GAP) + 1
+    return [wall for stretch in np.split(points, breaks) for wall in _straight(stretch)]
+
+
+def streets_of(walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float) -> list[Street]:
+    """The streets between walls, no two in one direction, clockwise from straight behind.
+
+    farther  how many metres from the robot a street has to go on
+    """
+    found: list[Street] = []
+    for street in sorted(_between(walls, points, reach, farther), key=lambda street: -street.length):
+        if all(apart(street.bearing, other.bearing) > STRAIGHT for other in found):
+            found.append(street)
+    return sorted(found, key=lambda street: -street.bearing)
+
+
+def apart(one: float, other: float) -> float:
+    """Radians between two directions."""
+    return abs(math.remainder(one - other, math.tau))
+
+
+def _straight(points: NDArray[np.complex128]) -> Iterator[Wall]:
+    """The walls of a stretch of points, which is parted where it is farthest off the line between its ends (Douglas and Peucker)."""
+    if len(points) < 5:
+        return
+    way = points[-1] - points[0]
+    off = np.abs(((points - points[0]) * np.conj(way)).imag) / max(abs(way), 1e-9)
+    worst = int(off.argmax())
+    if off[worst] > THICK and 0 < worst < len(points) - 1:
+        yield from _straight(points[: worst + 1])
+        yield from _straight(points[worst:])
+    elif abs(way) >= LONG:
+        yield _fitted(points)
+
+
+def _fitted(points: NDArray[np.complex128]) -> Wall:
+    """The line with the least squares of distances. Its direction is half the angle of the second moment."""
+    middle = points.mean()
+    direction = np.sqrt(((points - middle) ** 2).sum())
+    direction /= abs(direction)
+    along = ((points - middle) * np.conj(direction)).real
+    ends = middle + along[0] * direction, middle + along[-1] * direction
+    return Wall(complex(ends[0]), complex(ends[1]))
+
+
+def _between(walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float) -> Iterator[Street]:
+    """The streets between any two walls: one of them at the right of who goes along it, the other at the left."""
+    for right, left in permutations(walls, 2):
+        if apart(cmath.phase(right.way), cmath.phase(-left.way)) > PARALLEL:
+            continue
+        along = right.way - left.way
+        along /= abs(along)
+        (a, b), (c, d) = ((wall.start / along, wall.end / along) for wall in (right, left))
+        width = (c.imag + d.imag - a.imag - b.imag) / 2
+        near, far = max(a.real, d.real), min(b.real, c.real)
+        if not WIDTHS[0] * reach < width < WIDTHS[1] * reach or far < farther or far - max(near, 0.0) < LONG:
+            continue
+        lateral = (a.imag + b.imag + c.imag + d.imag) / 4
+        seen = points / along
+        inside = (np.abs(seen.imag - lateral) < width / 4) & (seen.real > max(near, 0.0)) & (seen.real < farther)
+        if inside.sum() < 3:
+            yield Street(cmath.phase(along), 1j * lateral * along, far - near)
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a panorama shows of a place.
+
+    streets  those that lead away from it, clockwise from straight behind the robot
+    fixed    the fixed point; None where a single street goes straight on, which is no place
+    """
+
+    streets: tuple[Street, ...]
+    fixed: complex | None
+
+    @classmethod
+    def of(cls, ranges: Array, reach: float, farthest: float) -> Place:
+        """The place that a panorama, (360,) metres, shows."""
+        points, beams = points_of(np.nan_to_num(ranges, nan=farthest), AROUND, farthest)
+        if not len(points):
+            return cls((), None)
+        first = int(np.abs(points - np.roll(points, 1)).argmax())  # a wall ends there, so none is cut in two
+        points, beams = np.roll(points, -first), (np.roll(beams, -first) - beams[first]) % 360
+        streets = streets_of(walls_of(points, beams), points, reach, FAR * reach)
+        return cls(tuple(streets), _meeting(streets) if len(streets) > 1 else _end(streets, points, reach))
+
+    @property
+    def headings(self) -> list[float]:
+        """The headings of dstates there, in radians: along each street, away from the place and, where no street is opposite, towards it."""
+        out = [street.bearing for street in self.streets]
+        return out + [bearing + math.pi for bearing in out if all(apart(bearing + math.pi, other) > STRAIGHT for other in out)]
+
+    def heading(self, about: float) -> float:
+        """The heading of a dstate that is nearest to one."""
+        return min(self.headings, key=lambda heading: apart(heading, about))
+
+    def beside(self, heading: float, side: int) -> float | None:
+        """How far to turn to the next street at the left (side=1) or at the right (-1), in radians; None if there is none before straight behind."""
+        turns = [side * (street.bearing - heading) % math.tau for street in self.streets]
+        return min((side * turn for turn in turns if STRAIGHT < turn < math.pi - STRAIGHT), key=abs, default=None)
+
+    def faces(self, heading: float) -> bool:
+        """Whether a street is straight ahead."""
+        return any(apart(street.bearing, heading) <= STRAIGHT for street in self.streets)
+
+
+def _meeting(streets: Sequence[Street]) -> complex | None:
+    """The point with the least squares of distances to all midlines."""
+    if len(streets) == 2 and apart(streets[0].bearing, streets[1].bearing + math.pi) <= STRAIGHT:
+        return None
+    across = np.array([1j * cmath.rect(1, street.bearing) for street in streets])
+    offsets = np.array([street.middle for street in streets])
+    rows = np.stack([across.real, across.imag], axis=1)
+    x, y = np.linalg.lstsq(rows, (across.conj() * offsets).real, rcond=None)[0]
+    return complex(x, y)
+
+
+def _end(streets: Sequence[Street], points: NDArray[np.complex128], reach: float) -> complex | None:
+    """The point of the midline of the only street that is `reach` before the wall at its end."""
+    for street in streets:
+        along = cmath.rect(1, street.bearing)
+        seen = (points - street.middle) / along
+        wall = seen.real[(seen.real < 0) & (np.abs(seen.imag) < reach / 2)]
+        if len(wall):
+            return street.middle + along * (float(np.median(wall)) + reach)
+    return None
+
+
+class Panorama:
+    """Ranges all around, one a degree, as far as images have shown them; the first one straight ahead of the robot as it began to turn.
+
+    headings  how the robot was turned at each image, in radians
+    """
+
+    def __init__(self, image: Array) -> None:
+        self.headings = [0.0]
+        self._rows = [_around(image, 0.0)]
+        self._first = self._rows[0]  # what was shown first of each degree
+
+    @property
+    def ranges(self) -> Array:
+        """(360,) metres, counter-clockwise; nan where no image has shown anything. A beam that is lost in one image is there in others."""
+        rows = np.array(self._rows)
+        shown = ~np.isnan(rows).all(axis=0)
+        ranges = np.full(360, np.nan)
+        ranges[shown] = np.nanmedian(rows[:, shown], axis=0)
+        return ranges
+
+    def add(self, image: Array, turned: float) -> None:
+        """Take in one more image, after a turn of about so many radians."""
+        heading = compass(self._first, image, self.headings[-1] + turned, turned)
+        self.headings.append(heading)
+        self._rows.append(_around(image, heading))
+        self._first = np.where(np.isnan(self._first), self._rows[-1], self._first)
+
+
+def compass(ranges: Array, image: Array, about: float, turned: float) -> float:
+    """How the robot is turned, in radians, that sees an image where the ranges around it are known: about so, and as the two agree best.
+
+    turned  how far the robot has turned since it last knew, by odometry, which may be off by a share of it
+    """
+    best = about
+    for window, step in ((2 + OFF * math.degrees(abs(turned)), 0.5), (0.5, 0.05)):
+        tried = best + np.radians(np.arange(-window, window + step / 2, step))
+        known = np.interp(np.degrees(tried[:, None] + BEARINGS), np.arange(360), ranges, period=360)
+        shown = ~np.isnan(known).any(axis=0)  # the same beams for all, or what is not known would look like agreement
+        off = np.minimum(np.abs(known[:, shown] - image[shown]), 0.3)
+        best = float(tried[int(off.mean(axis=1).argmin())])
+    return best
+
+
+def _around(image: Array, heading: float) -> Array:
+    """An image as ranges all around, (360,) metres; nan where it shows nothing."""
+    bearings = np.angle(np.exp(1j * (AROUND - heading)))
+    ranges: Array = np.interp(bearings, BEARINGS, image, left=np.nan, right=np.nan)
+    return ranges
