@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from itertools import pairwise, permutations, product
+from itertools import groupby, pairwise, permutations, product
+from operator import itemgetter
 from typing import TypeAlias
 
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
@@ -551,50 +552,50 @@ def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
         first += count + 1
 
 
-def faulty_facts(
-    seen: Sequence[int],
-    actions: Sequence[int],
-    steps: Sequence[int],
-    names: Mapping[int, int],
-    price: Mapping[str, int],
-    pairs: Pairs,
-    forbidden: Sequence[Collection[Equality]] = (),
-) -> tuple[str, dict[int, tuple[int, bool]]]:
-    """These steps of a trace as facts for faulty.lp, and for each name its view, and whether it is the rest.
+def faulty_rests(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
+    """The rest of each view, and the view."""
+    named = dict(names)
+    last = {view: name for name, view in faulty_names(named)}
+    return ((name, view) for view, name in last.items())
 
-    steps      ascending
-    names      how many names each view has, beside the rest
-    price      tenths of dstates for each kind of fault; 0 where there are none
-    forbidden  sets of equalities that do not all hold
+
+def faulty_base(actions: Iterable[int], names: Mapping[int, int], price: Mapping[str, int]) -> str:
+    """The names of dstates, the actions, and what faults cost, as facts for faulty.lp.
+
+    names  how many names each view has, beside the rest
+    price  tenths of dstates for each kind of fault; 0 where there are none
     """
-    found: list[str] = [f"action({action})." for action in sorted(set(actions))]
-    known: dict[int, tuple[int, bool]] = {}
-    before: int | None = None
-    for name, view in faulty_names(names):
-        is_first = before is None or known[before][0] != view
-        known[name] = view, False
-        found.append(f"view({name},{view}).")
-        if not is_first:
-            found.append(f"after({before},{name}).")
-        elif before is not None:
-            known[before] = known[before][0], True
-        before = name
-    assert before is not None
-    known[before] = known[before][0], True
-    found += [f"rest({name})." for name, (_, is_rest) in known.items() if is_rest]
-    given = set(steps)
-    for t in steps:
-        found.append(f"node({t},{seen[t]}).")
-        found += [f"misread({t},{price['misread']})."] if price["misread"] else []
-        if t + 1 in given:
-            found.append(f"link({t},{actions[t]},{t + 1}).")
-            found += [f"slipped({t},{price['slipped']})."] if price["slipped"] else []
-        found += [f"excluded({other},{t})." for other in pairs.apart.get(t, ()) if other in given]
-        found += [f"one({other},{t})." for other in pairs.one.get(t, ())]
-    found += [f"next({t},{u})." for t, u in pairwise(steps)]
-    for equalities in forbidden:
-        found.append(f":- {', '.join(f'is({e.first},S{k}), is({e.second},S{k})' for k, e in enumerate(equalities))}.")
-    return "\n".join(found), known
+    found = [f"action({action})." for action in sorted(set(actions))]
+    found += [f"price({kind},{tenths})." for kind, tenths in price.items() if tenths]
+    for view, some in groupby(faulty_names(names), key=itemgetter(1)):
+        of_view = [name for name, _ in some]
+        found += [f"view({name},{view})." for name in of_view]
+        found += [f"after({before},{name})." for before, name in pairwise(of_view)]
+        found.append(f"rest({of_view[-1]}).")
+    return "\n".join(found)
+
+
+def faulty_batch(batch: int, seen: Sequence[int], actions: Sequence[int], steps: Sequence[int], known: Sequence[int], pairs: Pairs) -> str:
+    """These steps of a trace as a batch of facts for faulty.lp.
+
+    steps  in the order in which they are given
+    known  those that were given before, in that order
+    """
+    given = {*known, *steps}
+    new = set(steps)
+    found = [f"node({batch},{t},{seen[t]})." for t in steps]
+    found += [f"next({batch},{t},{u})." for t, u in pairwise([*known[-1:], *steps])]
+    links = sorted({t for step in steps for t in (step - 1, step) if t in given and t + 1 in given})
+    found += [f"link({batch},{t},{actions[t]},{t + 1})." for t in links]
+    for t in given:
+        found += [f"excluded({batch},{i},{t})." for i in pairs.apart.get(t, ()) if i in given and (i in new or t in new)]
+        found += [f"one({batch},{i},{t})." for i in pairs.one.get(t, ()) if i in given and (i in new or t in new)]
+    return "\n".join(found)
+
+
+def not_all_one(equalities: Collection[Equality]) -> str:
+    """That these equalities of given steps do not all hold, as a rule for faulty.lp."""
+    return f":- {', '.join(f'is({e.first},S{k}), is({e.second},S{k})' for k, e in enumerate(equalities))}."
 
 
 def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int]]:

@@ -30,6 +30,7 @@ AROUND = 8  # So many steps before and behind one that a map does not predict ar
 PLACES = 12  # Steps around so many of those that the Viterbi pass disbelieves are given at once.
 NAMES = 3  # So many names a view has at first.
 MORE_NAMES = 2  # So many more it is given where its rest is used.
+OPTIONS = ("--opt-strategy=usc,stratify",)
 UNKNOWN = 0.5  # What the Viterbi pass pays, in tenths of dstates, where the map does not know where an action leads: less than any fault.
 
 
@@ -75,6 +76,10 @@ class FaultyEngine:
         self._names = dict.fromkeys(range(max(self._seen) + 1), NAMES)
         self._given: set[int] = set()
         self._forbidden: list[Collection[Equality]] = []
+        # What clingo was told: the names of views, the steps in the order in which they were given, in how many batches, and how many of the forbidden sets.
+        self._named: dict[int, int] = {}
+        self._told: list[int] = []
+        self._batches = self._ruled = 0
 
     def with_paths(self, paths: int) -> FaultyEngine:
         return FaultyEngine(self._task)
@@ -100,7 +105,7 @@ class FaultyEngine:
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         best: int | None = None
         while True:
-            answer = next(self._answers("opt"), None)
+            answer = self._best_answer()
             if answer is None:
                 return
             self.bound = max(self.bound or 0, answer.cost)
@@ -122,7 +127,7 @@ class FaultyEngine:
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         while True:
             found: list[Found] = []
-            for answer in self._answers(f"enum,{cost[0]}", enough):
+            for answer in self._answers_of_cost(cost[0], enough):
                 labels, failed = (None, -1) if answer.rests else self._followed(answer)
                 if labels is None:
                     break
@@ -155,29 +160,54 @@ class FaultyEngine:
         for view in views:
             self._names[view] += MORE_NAMES
 
-    def _answers(self, mode: str, enough: int = 0) -> Iterator[_Answer]:
-        """Answers for the given steps: the last one is the best (opt), or all that cost so much."""
-        steps = sorted(self._given)
-        program, names = facts.faulty_facts(
-            self._seen, self._actions, steps, self._names, self._price, self._task.log.pairs, self._forbidden
-        )
-        options = ["--opt-strategy=usc,stratify"] if mode == "opt" else []
+    def _prepare(self) -> None:
+        """Tell clingo of the given steps that it does not know yet; a new control where views have more names than it knows."""
         with self.asker.grounding_timed():
-            self.asker.control = control = Control(options, self.asker.watch.check)
-            control.load_encodings("faulty")
-            control.add("base", [], program)
-            control.ground([("base", [])])
+            if self._named != self._names:
+                self._named, self._told = dict(self._names), []
+                self._batches = self._ruled = 0
+                self.asker.control = Control(OPTIONS, self.asker.watch.check)
+                self.asker.control.load_encodings("faulty")
+                self.asker.control.add("base", [], facts.faulty_base(self._actions, self._names, self._price))
+                self.asker.control.ground([("base", [])])
+            control = self.asker.control
+            if new := sorted(self._given.difference(self._told)):
+                batch = self._batches
+                control.add(
+                    f"batch_{batch}", [], facts.faulty_batch(batch, self._seen, self._actions, new, self._told, self._task.log.pairs)
+                )
+                control.ground([(f"batch_{batch}", []), ("more", facts.numbers(batch))])
+                self._told += new
+                self._batches += 1
+            for number in range(self._ruled, len(self._forbidden)):
+                control.add(f"forbidden_{number}", [], facts.not_all_one(self._forbidden[number]))
+                control.ground([(f"forbidden_{number}", [])])
+            self._ruled = len(self._forbidden)
 
-        def read(model: clingo.Model) -> _Answer:
-            where, slips = facts.read_faulty(model)
-            rests = frozenset(names[s][0] for s in set(where.values()) if names[s][1])
-            return _Answer(model.cost[0] if model.cost else 0, where, slips, rests)
+    def _best_answer(self) -> _Answer | None:
+        """A minimal answer for the given steps."""
+        self._prepare()
+        last = deque(self.asker.answers(self._read, "opt", 0), maxlen=1)
+        return last[0] if last else None
 
-        answers = self.asker.answers(read, mode, enough if mode != "opt" else 0)
-        if mode != "opt":
-            yield from answers
-            return
-        yield from deque(answers, maxlen=1)
+    def _answers_of_cost(self, cost: int, enough: int) -> Iterator[_Answer]:
+        """Answers for the given steps that cost so much, which is the least."""
+        self._prepare()
+        minimal = (answer for answer in self.asker.answers(self._read, "optN", 0) if answer.cost == cost)
+        seen: set[tuple[frozenset[tuple[int, int]], frozenset[int]]] = set()
+        for answer in minimal:  # the one that shows that there are no cheaper ones comes twice
+            told = frozenset(answer.where.items()), answer.slips
+            if told not in seen:
+                seen.add(told)
+                yield answer
+                if len(seen) == enough:
+                    return
+
+    def _read(self, model: clingo.Model) -> _Answer:
+        where, slips = facts.read_faulty(model)
+        used = set(where.values())
+        rests = frozenset(view for name, view in facts.faulty_rests(self._names) if name in used)
+        return _Answer(model.cost[0] if model.cost else 0, where, slips, rests)
 
     def _machine(self, answer: _Answer) -> tuple[dict[int, int], _Machine]:
         """The number of each dstate that is named, by first visit, and what they are."""
