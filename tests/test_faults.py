@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise, product
+from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from brute_force import key, minimal_maps
@@ -14,11 +17,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import faulty_machine
 
-from ssh_abduction import Speedups, Status, Theory, Trace, solve
+from ssh_abduction import OnlineMapper, Speedups, Status, Theory, Trace, solve
 from ssh_abduction.cli import main
+from ssh_abduction.engines import faulty
 from ssh_abduction.errors import MapError, TheoryError
+from ssh_abduction.front import fault_front
 from ssh_abduction.judge.checker import check
 from ssh_abduction.maps import Fault, SSHMap
+from ssh_abduction.solver import search
 
 Told = tuple[tuple[int, ...], frozenset[tuple[int, str, object]]]  # the labels of the steps, and the faults
 
@@ -85,11 +91,6 @@ def test_causal_maps_with_faults_are_those_of_brute_force(trace: Trace, misread:
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(st.data())
 def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) -> None:
-    from unittest.mock import patch
-
-    from ssh_abduction.engines import faulty
-    from ssh_abduction.solver import search
-
     trace = data.draw(small_traces(max_steps=7))
     theory = Theory.causal().replace(misread=data.draw(st.sampled_from([0.0, 0.4, 1.0])), slipped=data.draw(st.sampled_from([0.3, 1.0])))
     with patch.multiple(faulty, AT_FIRST=2, AROUND=0, PLACES=1, NAMES=1, MORE_NAMES=1), patch.object(search, "FEW_STEPS", 0):
@@ -190,8 +191,8 @@ def test_what_faults_do_not_go_with_is_refused(choices: dict[str, object], said:
         Theory(**choices)  # type: ignore[arg-type]
 
 
-def test_in_the_shell(tmp_path: object, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(str(tmp_path))
+def test_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     RECTANGLE.save("trace.jsonl")
     assert main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--slipped", "3"]) == 0
     said = capsys.readouterr().out
@@ -200,3 +201,58 @@ def test_in_the_shell(tmp_path: object, capsys: pytest.CaptureFixture[str], monk
     answer = json.loads(capsys.readouterr().out)
     assert answer["maps"][0]["faults"] == [{"step": 9, "kind": "misread", "seen": "v0", "expected": "v1"}]
     assert answer["cost"]["faults"] == 1.5
+
+
+def test_the_front_is_what_brute_force_finds() -> None:
+    trace = Trace.from_steps("abababba", ["right", "travel"] * 3 + ["right"])
+    for kinds in ({"misread": 1.5}, {"slipped": 1.5}, {"misread": 1.5, "slipped": 1.5}):
+        front = fault_front(trace, Theory.causal().replace(**kinds), most=3)
+        assert [point.proven for point in front.points] == [True] * 4
+        assert [point.dstates for point in front.points] == [fewest(trace, faults, set(kinds)) for faults in range(4)]
+        for point in front.points:
+            assert point.map is not None
+            assert len(point.map.faults) <= point.faults
+            assert check(trace, point.map, Theory.causal().replace(**kinds)) == ()
+
+
+def fewest(trace: Trace, faults: int, kinds: set[str]) -> int:
+    """The fewest dstates with so many faults, by trying all labels."""
+    counts = []
+    for labels in partitions(len(trace)):
+        views, ends = defaultdict(Counter), defaultdict(Counter)
+        for label, view in zip(labels, trace.views, strict=True):
+            views[label][view] += 1
+        for (s, x), action in zip(pairwise(labels), trace.actions, strict=False):
+            ends[s, action.name][x] += 1
+        wrong, slips = (sum(sum(c.values()) - max(c.values()) for c in found.values()) for found in (views, ends))
+        if (not wrong or "misread" in kinds) and (not slips or "slipped" in kinds) and wrong + slips <= faults:
+            counts.append(len(views))
+    return min(counts)
+
+
+def test_the_front_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    RECTANGLE.save("trace.jsonl")
+    assert main(["solve", "trace.jsonl", "--front", "2", "--theory", "causal", "--misread", "1.5"]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"^  1 +4 +knee +the view at step 9 is misread: v0, expected v1$", said, re.MULTILINE)
+    assert "a fault that costs more than 0 and less than 9 dstates" in said
+    assert main(["solve", "trace.jsonl", "--front", "1", "--json"]) == 0
+    assert [point["dstates"] for point in json.loads(capsys.readouterr().out)["front"]] == [13, 4]
+    assert main(["solve", "trace.jsonl", "--front", "2", "--theory", "topological"]) == 1
+    assert "expected a causal theory" in capsys.readouterr().err
+    assert main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--within", "1"]) == 1
+    assert "within: expected 0 where faults are allowed" in capsys.readouterr().err
+
+
+def test_a_driving_robot_is_not_told_of_faults() -> None:
+    with pytest.raises(TheoryError, match="expected no faults while the robot drives"):
+        OnlineMapper("v0", Theory.causal().replace(misread=1.5))
+
+
+def test_a_limit_leaves_a_map_and_a_bound() -> None:
+    walk, _, _ = faulty_machine(20, 8, steps=300, seed=1, wrong=3)
+    solution = solve(walk.trace, Theory.causal().replace(misread=1.5), limit=0.3)
+    assert solution.status in (Status.FEASIBLE, Status.OPTIMAL)
+    assert solution.bound.tenths is not None
+    assert check(walk.trace, solution.maps[0], Theory.causal().replace(misread=1.5)) == ()

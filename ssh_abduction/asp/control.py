@@ -188,7 +188,7 @@ class Asker:
         until      asked now and then; where it is true, the search ends
         ahead      let clingo search for the next answer while the caller uses this one
         """
-        project = "no" if mode.split(",")[0] == "opt" else "project"
+        project = "no" if mode.partition(",")[0] == "opt" else "project"
         with self._solving(control or self.control, assumptions, mode, models, project, conflicts, on_bound) as handle:
             handle.resume()
             while True:

@@ -559,14 +559,20 @@ def faulty_rests(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
     return ((name, view) for view, name in last.items())
 
 
-def faulty_base(actions: Iterable[int], names: Mapping[int, int], price: Mapping[str, int]) -> str:
+def at_most_faults(most: int) -> str:
+    """That the steps given so far have so many faults at most, as a rule for faulty.lp."""
+    return f":- #count {{ T,misread : misreads(T); T,slipped : slips(T) }} > {most}."
+
+
+def faulty_base(actions: Iterable[int], names: Mapping[int, int], price: Mapping[str, int], *, free: bool = False) -> str:
     """The names of dstates, the actions, and what faults cost, as facts for faulty.lp.
 
     names  how many names each view has, beside the rest
     price  tenths of dstates for each kind of fault; 0 where there are none
+    free   whether faults cost nothing
     """
     found = [f"action({action})." for action in sorted(set(actions))]
-    found += [f"price({kind},{tenths})." for kind, tenths in price.items() if tenths]
+    found += [f"price({kind},{0 if free else tenths})." for kind, tenths in price.items() if tenths]
     for view, some in groupby(faulty_names(names), key=itemgetter(1)):
         of_view = [name for name, _ in some]
         found += [f"view({name},{view})." for name in of_view]

@@ -38,6 +38,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "--json", action="store_true", help="print the solution as JSON, map by map as they are found; of many traces, a line each"
     )
+    front = "instead, the fewest dstates for 0, 1, … K faults, and the knee, by the causal theory (--misread, --slipped: only these kinds)"
+    parser.add_argument("--front", type=int, metavar="K", help=front)
     parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds with the best answer so far")
     parser.add_argument(
         "--without-speedups", default="", metavar="NAMES", help=f"leave these out, of {', '.join(SPEEDUPS)}; commas between"
@@ -57,6 +59,10 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    if options.front is not None:
+        from ssh_abduction.cli import front
+
+        return front.run(options)
     if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
         from ssh_abduction.cli import batch
 

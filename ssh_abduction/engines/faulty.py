@@ -64,9 +64,14 @@ class FaultyEngine:
     lists_least = False
     goes_on = False
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Task, most_faults: int | None = None) -> None:
+        """Nothing is given to clingo yet.
+
+        most_faults  where this is a number, maps have so many faults at most, which then cost nothing
+        """
         self.asker = Asker(task.watch)
         self.intact = True
+        self._most_faults = most_faults
         self.paths = 0
         self.size = 0
         self.bound: int | None = None
@@ -110,19 +115,23 @@ class FaultyEngine:
                 return
             self.bound = max(self.bound or 0, answer.cost)
             if answer.rests:
-                self._name_more(answer.rests)
+                self._name_more(answer)
                 continue
             labels, failed = self._followed(answer)
             if labels is not None:
                 yield self._found(labels, answer.slips, self._machine(answer)[0])
                 return
             explained, doubted = self._explained(answer)
-            if explained is not None and (best is None or explained.cost[0] < best):
-                best = explained.cost[0]
+            if explained is not None and (best is None or self._cost_of(explained) < best):
+                best = self._cost_of(explained)
                 yield explained
                 if best <= self.bound:
                     return
             self._give([failed, *doubted])
+
+    def _cost_of(self, found: Found) -> int:
+        """Tenths of dstates, as clingo counts them."""
+        return found.cost[0] if self._most_faults is None else 10 * len(found.map.dstates)
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         while True:
@@ -136,7 +145,7 @@ class FaultyEngine:
                 yield from found
                 return
             if answer.rests:
-                self._name_more(answer.rests)
+                self._name_more(answer)
             else:
                 self._give([failed])
 
@@ -156,9 +165,11 @@ class FaultyEngine:
         for step in steps:
             self._given |= set(range(max(step - AROUND, 0), min(step + AROUND + 1, self.size)))
 
-    def _name_more(self, views: Collection[int]) -> None:
-        for view in views:
-            self._names[view] += MORE_NAMES
+    def _name_more(self, answer: _Answer) -> None:
+        """Give the views more names whose rest is used, and also those all of whose names are."""
+        used = Counter(view for name, view in facts.faulty_names(self._names) if name in set(answer.where.values()))
+        for view in self._names:
+            self._names[view] += MORE_NAMES if view in answer.rests else used[view] == self._names[view]
 
     def _prepare(self) -> None:
         """Tell clingo of the given steps that it does not know yet; a new control where views have more names than it knows."""
@@ -168,7 +179,9 @@ class FaultyEngine:
                 self._batches = self._ruled = 0
                 self.asker.control = Control(OPTIONS, self.asker.watch.check)
                 self.asker.control.load_encodings("faulty")
-                self.asker.control.add("base", [], facts.faulty_base(self._actions, self._names, self._price))
+                self.asker.control.add(
+                    "base", [], facts.faulty_base(self._actions, self._names, self._price, free=self._most_faults is not None)
+                )
                 self.asker.control.ground([("base", [])])
             control = self.asker.control
             if new := sorted(self._given.difference(self._told)):
@@ -177,6 +190,9 @@ class FaultyEngine:
                     f"batch_{batch}", [], facts.faulty_batch(batch, self._seen, self._actions, new, self._told, self._task.log.pairs)
                 )
                 control.ground([(f"batch_{batch}", []), ("more", facts.numbers(batch))])
+                if self._most_faults is not None:
+                    control.add(f"most_{batch}", [], facts.at_most_faults(self._most_faults))
+                    control.ground([(f"most_{batch}", [])])
                 self._told += new
                 self._batches += 1
             for number in range(self._ruled, len(self._forbidden)):
@@ -267,7 +283,7 @@ class FaultyEngine:
         seen_right = right | {labels[t] for t in range(self.size) if shows[labels[t]] == self._seen[t]}
         if (misread and not self._price["misread"]) or (slips and not self._price["slipped"]) or set(labels) - seen_right:
             return None
-        if self._task.log.pairs.broken_by(labels):
+        if self._task.log.pairs.broken_by(labels) or (self._most_faults is not None and len(misread) + len(slips) > self._most_faults):
             return None
         return self._found(labels, slips, {}, shows)
 

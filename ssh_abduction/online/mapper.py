@@ -56,7 +56,7 @@ from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.asp.limits import check_limit
 from ssh_abduction.engines.base import AT_ONCE, Cost
-from ssh_abduction.errors import TraceError, brief
+from ssh_abduction.errors import TheoryError, TraceError, brief
 from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import check, unchecked
 from ssh_abduction.maps import SSHMap
@@ -113,6 +113,8 @@ class OnlineMapper:
     ) -> None:
         first = Step.of(view, star, "step 0")
         theory = checked_theory(theory)
+        if theory.has_faults:
+            raise TheoryError("theory: expected no faults while the robot drives, got misread or slipped; leave them out, or solve the log")
         check_limit("limit", "seconds", limit)
         checked_speedups(speedups)
         self._odometry = None if odometry is None else Odometry.of(odometry)

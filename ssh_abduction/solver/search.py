@@ -52,7 +52,7 @@ from ssh_abduction.asp.limits import LimitError, StageTimeError, Stop, Watch, ch
 from ssh_abduction.asp.rules import check_rules
 from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Task, cost_as_counted
 from ssh_abduction.engines.stepwise import StepEngine
-from ssh_abduction.errors import SolverError, brief
+from ssh_abduction.errors import SolverError, TheoryError, brief
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.backbone import Rivals
@@ -152,6 +152,10 @@ class Search:
         if on_progress is not None and not callable(on_progress):
             raise SolverError(f"on_progress: expected a function of one Progress, got {brief(on_progress)}")
         self.theory = checked_theory(theory).resolve(trace)
+        if within and self.theory.has_faults:
+            raise TheoryError(
+                "within: expected 0 where faults are allowed; leave it out, or see what each number of faults is worth (--front)"
+            )
         check_rules(self.theory)
         self.trace = trace
         self._begun = False

@@ -1,0 +1,48 @@
+"""ssh-abduction solve TRACE --front K: the fewest dstates for 0, 1, … K faults."""
+
+from __future__ import annotations
+
+import argparse
+
+from ssh_abduction.cli.options import theory_of
+from ssh_abduction.cli.outcome import dump
+from ssh_abduction.cli.text import table
+from ssh_abduction.errors import SSHError
+from ssh_abduction.front import Front, fault_front
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Trace
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the front. Exit code 0 if all of it is proven, else 10, as for solve."""
+    if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
+        raise SSHError("--front: expected one trace, got several, or --jobs or --scheduler; ask for each trace by itself")
+    front = fault_front(Trace.load(options.traces[0]), theory_of(options, Theory.causal()), options.front, options.time_limit)
+    print(dump(_as_data(front)) if options.json else _as_text(front, options.front))
+    return 0 if len(front.points) == options.front + 1 and all(point.proven for point in front.points) else 10
+
+
+def _as_text(front: Front, most: int) -> str:
+    rows = []
+    for point in front.points:
+        faults = "; ".join(map(str, point.map.faults)) if point.map else "–"
+        shown = str(point.dstates) if point.proven else f"at least {point.dstates}"
+        rows.append([point.faults, shown, "knee" if point.faults == front.knee else "", faults or "none"])
+    lines = [table(["faults", "dstates", "", "of the map found"], rows)]
+    if front.prices:
+        lines.append(
+            f"a fault that costs more than {front.prices[0]:g} and less than {front.prices[1]:g} dstates makes the map at the knee minimal among these"
+        )
+    elif len(front.points) > most:
+        lines.append("no knee: each further fault saves about as many dstates")
+    if len(front.points) <= most:
+        lines.append(f"stopped at {front.points[-1].faults} faults by the time limit")
+    return "\n".join(lines)
+
+
+def _as_data(front: Front) -> dict[str, object]:
+    points = [
+        {"faults": p.faults, "dstates": p.dstates, "proven": p.proven, "map": None if p.map is None else p.map.to_dict()}
+        for p in front.points
+    ]
+    return {"knee": front.knee, "prices": None if front.prices is None else list(front.prices), "front": points}
