@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,19 +19,14 @@ from perception.images import images_of
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import recogniser
 from perception.views import ViewClusterer
-from ssh_abduction.errors import SSHError
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.labels import AmbiguousMapWarning, LearnerError, labels_of
+from ssh_abduction.runner_up import RunnerUpWarning, SecondMap, second_map, with_runner_up
+from ssh_abduction.solver.result import Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Trace, checked_trace
 
-
-class LearnerError(SSHError):
-    """The loop cannot be closed: there is no map, or the maps agree on no label."""
-
-
-class AmbiguousMapWarning(UserWarning):
-    """Several minimal maps remain: only the labels that they agree on are learnt from."""
+__all__ = ["AmbiguousMapWarning", "BootstrapLearner", "LearnerError", "RunnerUpWarning", "labels_of"]
 
 
 class BootstrapLearner:
@@ -43,7 +37,8 @@ class BootstrapLearner:
     choose     the index of the map to take where several remain; None takes the labels on which all of them agree
     limit      seconds for finding the map
 
-    After `fit` there are clusterer_, views_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree, and recogniser_.
+    After `fit` there are clusterer_, views_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree,
+    recogniser_, and second_map_, the map of the runner-up, where another number of views is about as good and gives another map.
     """
 
     def __init__(self, theory: Theory | None = None, clusterer: Any = None, choose: int | None = None, limit: float | None = None) -> None:
@@ -61,9 +56,11 @@ class BootstrapLearner:
         images = images_of(checked_trace(trace))
         self.clusterer_ = self.clusterer or ViewClusterer(random_state=0)
         self.views_ = self.clusterer_.fit(ReciprocalTransformer().fit_transform(images)).labels_
-        self.solution_ = solve(trace.with_views(self.views_.tolist()), theory, limit=self.limit)
-        self.labels_ = labels_of(self.solution_.maps, self.choose, self.solution_.complete)
+        seen = with_runner_up(trace.with_views(self.views_.tolist()), self._second_views())
+        self.solution_ = solve(seen, theory, limit=self.limit)
+        self.labels_ = labels_of(self.solution_.maps, self.choose, self.solution_.complete, self.solution_.status is Status.OPTIMAL)
         self.map_ = self.solution_.maps[self.choose or 0]
+        self.second_map_ = self._second_map(seen, theory)
         sure = self.labels_ >= 0
         self.recogniser_ = recogniser().fit(images[sure], self.labels_[sure])
         return self
@@ -74,36 +71,14 @@ class BootstrapLearner:
             raise LearnerError("learner: expected one that has learnt, got a new one; call fit with a trace first")
         return np.asarray(self.recogniser_.predict(images), np.intp)
 
+    def _second_map(self, seen: Trace, theory: Theory) -> SecondMap | None:
+        """The map of the runner-up, where it is another one, with a warning."""
+        found = second_map(seen, self.solution_.maps, theory, self.limit)
+        if found:
+            warnings.warn(found.sentence, RunnerUpWarning, stacklevel=3)
+        return found
 
-def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool = True) -> NDArray[np.intp]:
-    """The label of each step, (n,): its dstate in the chosen map; or, if none is chosen, in the first map, and -1 where the maps disagree.
-
-    Maps agree on a step if the first step at its dstate is the same in all of them. Warns if no map is chosen and they do not agree
-    everywhere, or if there may be more (`complete` is false). Raises LearnerError where no map or no label is left.
-    """
-    if not maps:
-        raise LearnerError("maps: expected at least one to take labels from, got none; see the solution's status")
-    if choose is not None and not 0 <= choose < len(maps):
-        raise LearnerError(f"map: expected an index from 0 to {len(maps) - 1}, got {choose}")
-    labels = np.array(maps[choose or 0].labels, np.intp)
-    if choose is not None:
-        return labels
-    for i, ssh_map in enumerate(maps):
-        if len(ssh_map.labels) != len(labels):
-            raise LearnerError(
-                f"maps: expected maps of one trace, {len(labels)} labels each, got {len(ssh_map.labels)} in map {i + 1}; solve one trace"
-            )
-    first = [_first_steps(ssh_map) for ssh_map in maps]
-    agreed = np.all([f == first[0] for f in first], axis=0)
-    if not agreed.all() or not complete:
-        unsure = f"{len(maps)} minimal maps{'' if complete else ' or more'} remain, and agree on {agreed.sum()} of {len(agreed)} labels"
-        warnings.warn(f"{unsure}: only these are learnt from; choose a map, or explore more", AmbiguousMapWarning, stacklevel=2)
-    if not agreed.any():
-        raise LearnerError("labels: expected some that all maps agree on, got none; choose a map")
-    return np.where(agreed, labels, -1)
-
-
-def _first_steps(ssh_map: SSHMap) -> NDArray[np.intp]:
-    """For each step, (n,), the first step at its dstate."""
-    _, first, dstates = np.unique(ssh_map.labels, return_index=True, return_inverse=True)
-    return np.asarray(first[dstates], np.intp)
+    def _second_views(self) -> list[int] | None:
+        """The views of the runner-up, where the clusterer has one."""
+        other = getattr(self.clusterer_, "runner_up_", None)
+        return None if other is None else self.clusterer_.labels_by_k_[other].tolist()

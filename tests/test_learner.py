@@ -22,9 +22,11 @@ from simulator.world import World
 from ssh_abduction import Step, Theory, Trace, solve
 from ssh_abduction import learner as learner_module
 from ssh_abduction.cli import main
+from ssh_abduction.errors import TraceError
 from ssh_abduction.judge.checker import check
-from ssh_abduction.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, labels_of
+from ssh_abduction.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning, labels_of
 from ssh_abduction.reproduce.claims import EXPERIMENTS, claims, one_to_one, outcome, rate, summary, true_dstates
+from ssh_abduction.runner_up import runner_up, second_map, with_runner_up
 
 VIEWS_ALONE = Theory.topological().replace(star="none")
 
@@ -97,8 +99,13 @@ def test_where_maps_disagree_nothing_is_learnt_unless_one_is_chosen() -> None:
 
 def test_an_incomplete_list_of_maps_is_said() -> None:
     maps = solve(Trace.from_steps("aba", ["travel", "travel"])).maps
-    with pytest.warns(AmbiguousMapWarning, match="1 minimal maps or more remain"):
+    with pytest.warns(AmbiguousMapWarning, match="at least 1 minimal map remains, and agree"):
         labels_of(maps, complete=False)
+    with pytest.warns(AmbiguousMapWarning) as caught:
+        labels_of(maps, complete=False, proven=False)
+    assert [str(w.message).split(":")[0] for w in caught] == [
+        f"the map of {len(maps[0].dstates)} dstates is the best that was found, and not proven minimal"
+    ]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         labels_of(maps)
@@ -109,6 +116,70 @@ def test_other_clusterings_can_be_plugged_in(run: Trace) -> None:
 
     clusterer = ViewClusterer(clusterer=AgglomerativeClustering(linkage="complete"), k_max=10)
     assert one_to_one(BootstrapLearner(VIEWS_ALONE, clusterer).fit(run).labels_, true_dstates(run))
+
+
+# Doubts about the number of views
+
+
+@pytest.fixture(scope="module")
+def large_room() -> Trace:
+    """Eight circuits in a room a tenth longer and wider, where M prefers 2 views, and trimmed M 4."""
+    world = World.named("notched-rectangle")
+    walls = world.segments.copy()
+    walls[walls > 0] *= 1.1
+    trace = simulate(replace(world, segments=walls, start=(3.8, 1.6, 0.0), dstates=()), tours=8, seed=500, stars=False)
+    return replace(trace.without_displacements(), steps=tuple(replace(s, displacement=None) for s in trace.steps))
+
+
+def test_another_map_of_the_runner_up_is_said(large_room: Trace) -> None:
+    with pytest.warns(RunnerUpWarning, match="2 views may be too few: 4 separate .* another map, of 8 dstates instead of 6; cluster"):
+        learner = BootstrapLearner().fit(large_room)
+    assert (learner.clusterer_.k_, learner.clusterer_.runner_up_, len(learner.map_.dstates)) == (2, 4, 6)
+    with pytest.warns(RunnerUpWarning, match="4 views may be too many: 2 separate"):
+        trimmed = BootstrapLearner(clusterer=ViewClusterer(by="trimmed", k_max=6, random_state=0)).fit(large_room)
+    assert len(trimmed.map_.dstates) == 8
+
+
+def test_the_shell_says_it_too(large_room: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = "ssh-abduction: warning: 2 views may be too few: 4 separate the images about as well, and give another map, of 8 dstates instead of 6"
+    run, views = str(tmp_path / "run.jsonl"), str(tmp_path / "views.jsonl")
+    large_room.save(run)
+    assert main(["cluster", run, "-o", views, "--k-max", "6"]) == 0
+    clustered = capsys.readouterr()
+    assert clustered.err.startswith(said)
+    marks = [line.split()[3:] for line in clustered.out.splitlines()[1:4]]
+    assert marks == [["chosen"], [], ["runner-up"]]
+    assert main(["solve", views]) == 0
+    assert capsys.readouterr().err.startswith(said)
+    assert main(["solve", views, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["warnings"][0].startswith(said[len("ssh-abduction: warning: ") :])
+    assert main(["solve", views, "--time-limit", "0.1"]) in {0, 10}  # no time for it
+    assert capsys.readouterr().err == ""
+    assert main(["cluster", views, "-o", views, "--k", "4"]) == 0
+    assert capsys.readouterr().err == ""
+    assert "runner_up" not in Path(views).read_text()
+
+
+def test_a_runner_up_is_whole_or_wrong() -> None:
+    trace = Trace.from_steps("aba", ["travel", "travel"])
+    assert runner_up(trace) is None
+    other = with_runner_up(trace, "abc")
+    assert runner_up(other) == replace(
+        trace.with_views("abc"), steps=tuple(replace(s, view=v) for s, v in zip(other.steps, "abc", strict=True))
+    )
+    assert with_runner_up(other, None) == trace
+    half = replace(trace, steps=(other.steps[0], *trace.steps[1:]))
+    with pytest.raises(TraceError, match="step 1: runner_up: expected a view, as other steps have one"):
+        runner_up(half)
+    wrong = replace(trace, steps=tuple(replace(s, extra={"runner_up": 1.5}) for s in trace.steps))
+    with pytest.raises(TraceError, match=r"runner_up: views\[0\]: expected a text or an integer, got 1.5"):
+        runner_up(wrong)
+    assert second_map(with_runner_up(trace, "xyx"), solve(trace).maps) is None  # other names of the same views
+    found = second_map(with_runner_up(trace, "aaa"), solve(trace, Theory.causal()).maps, Theory.causal())
+    assert found is not None
+    assert found.sentence.startswith(
+        "2 views may be too many: 1 separate the images about as well, and give another map, of 1 dstates instead of 2"
+    )
 
 
 # Images
@@ -221,7 +292,7 @@ def test_from_simulation_to_recognition_in_the_shell(tmp_path: Path, capsys: pyt
     assert main(["cluster", path("run.jsonl"), "-o", path("views.jsonl"), "--k-max", "8", "--plot", path("fig.png")]) == 0
     out = capsys.readouterr().out
     assert "4 views of 80 images" in out
-    assert out.splitlines()[0].split() == ["k", "M", "U"]
+    assert out.splitlines()[0].split() == ["k", "M", "trimmed", "U"]
     assert (tmp_path / "fig.png").read_bytes().startswith(b"\x89PNG")
     assert main(["solve", path("views.jsonl"), "--json"]) == 0
     (tmp_path / "maps.json").write_text(capsys.readouterr().out)

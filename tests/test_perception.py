@@ -29,7 +29,7 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from perception import quality, store, views
 from perception.errors import ImageWarning, PerceptionError
-from perception.quality import cluster_quality, cluster_spread, spanning_tree, uncertainty_coefficient
+from perception.quality import cluster_quality, cluster_spread, spanning_tree, trimmed_quality, uncertainty_coefficient
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecognizer, learning_curve, recogniser
 from perception.views import ViewClusterer
@@ -189,6 +189,42 @@ def test_memory_is_that_of_blocks_not_of_all_pairs() -> None:
     assert peak < 100 * 2**20 < 6_000**2 * 8
 
 
+# M, trimmed
+
+
+def test_trimmed_quality_is_the_ratio_of_quantiles() -> None:
+    images, truth = blobs(4, 10, spread=0.4, seed=3)
+    distances = squareform(pdist(images))
+    for trim in (0.0, 0.1, 0.5):
+        gaps = [np.quantile(distances[truth == a][:, truth == b], trim) for a in range(4) for b in range(a)]
+        widths = [np.quantile(pdist(images[truth == a]), 1 - trim) for a in range(4)]
+        assert trimmed_quality(images, truth, trim) == pytest.approx(min(gaps) / max(widths))
+    assert trimmed_quality(images, truth, 0) == pytest.approx(cluster_quality(images, truth))
+    with pytest.raises(PerceptionError, match=r"trim: expected a share from 0 to 0\.5, got 0\.6"):
+        trimmed_quality(images, truth, 0.6)
+    with pytest.raises(PerceptionError, match="labels: expected a row of 40 labels"):
+        trimmed_quality(images, truth[1:])
+
+
+def test_trimmed_quality_where_it_degenerates(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = np.array([[0.0], [0.0], [1.0], [3.0]])
+    assert math.isnan(trimmed_quality(images, [0, 0, 0, 0]))
+    assert trimmed_quality(images, [0, 1, 2, 3]) == 0
+    assert trimmed_quality(images, [0, 0, 1, 2]) == math.inf
+    many, truth = blobs(3, 100)
+    monkeypatch.setattr(quality, "SAMPLE", 60)
+    assert trimmed_quality(many, truth) == pytest.approx(trimmed_quality(*blobs(3, 20)), rel=0.3)  # of a sample
+    assert trimmed_quality(many, ~np.isin(np.arange(300), quality.sampled(300))) == 0  # a cluster that the sample does not hold
+
+
+def test_one_lost_beam_changes_m_and_not_trimmed_m() -> None:
+    images, truth = blobs(4, 20)
+    spoilt = images.copy()
+    spoilt[0, 0] += 2.5  # almost as far as the next cluster
+    assert cluster_quality(spoilt, truth) < 0.4 * cluster_quality(images, truth)
+    assert trimmed_quality(spoilt, truth) == pytest.approx(trimmed_quality(images, truth), rel=0.05)
+
+
 # U
 
 
@@ -223,6 +259,25 @@ def test_k_is_where_the_quality_peaks() -> None:
     assert (found.predict(images) == found.labels_).all()
     nearest = np.linalg.norm(images[:, None] - found.cluster_centers_, axis=2).argmin(axis=1)
     assert (found.predict(images) == nearest).all()
+
+
+def test_the_runner_up_is_what_trimmed_m_likes_about_as_well() -> None:
+    """Two pairs of clusters, each pair near each other: the farther they are, the less doubt there is that there are four."""
+    rng = np.random.default_rng(0)
+    found = {}
+    for gap in (0.5, 1.1, 4.0):
+        images = np.concatenate([rng.normal(c, 0.1, (15, 6)) for c in (0, gap, 8, 8 + gap)])
+        found[gap] = ViewClusterer(k_max=6, random_state=0).fit(images)
+    assert [(f.k_, f.runner_up_) for f in found.values()] == [(2, None), (2, 4), (4, None)]
+    assert [max(f.trimmed_, key=f.trimmed_.__getitem__) for f in found.values()] == [2, 4, 4]
+    assert found[1.1].labels_by_k_.keys() == found[1.1].trimmed_.keys() == found[1.1].quality_.keys()
+    spoilt = images.copy()
+    spoilt[0, 0] += 4  # one beam of one image, as far off as the next cluster: M makes a view of that image
+    by = {by: ViewClusterer(k_max=6, by=by, random_state=0).fit(spoilt).k_ for by in ("M", "trimmed")}
+    assert by == {"M": 5, "trimmed": 4}
+    assert (ViewClusterer(k=3).fit(images).runner_up_, ViewClusterer(clusterer=DBSCAN(eps=1.0)).fit(images).runner_up_) == (None, None)
+    with pytest.raises(PerceptionError, match='by: expected "M" or "trimmed", got \'U\''):
+        ViewClusterer(by="U").fit(images)
 
 
 def test_many_images_are_clustered_from_a_sample(monkeypatch: pytest.MonkeyPatch) -> None:

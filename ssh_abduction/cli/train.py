@@ -51,6 +51,7 @@ def _labelled(options: argparse.Namespace) -> tuple[Any, Any]:
         maps,
         None if options.map is None else options.map - 1,
         bool(data.get("complete", True)) if isinstance(data, dict) else True,
+        data.get("status", "optimal") == "optimal" if isinstance(data, dict) else True,
     )
     if len(labels) != len(trace):
         raise MapError(

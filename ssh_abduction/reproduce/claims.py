@@ -21,7 +21,7 @@ from perception.images import images_of
 from perception.quality import uncertainty_coefficient
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import LearningCurve, learning_curve, recogniser
-from perception.views import ViewClusterer, labels_by_k
+from perception.views import ViewClusterer
 from simulator.control import STILL
 from simulator.laser import Laser
 from simulator.tours import simulate
@@ -104,7 +104,7 @@ def measure(name: str, seed: int) -> Run:
     learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(k_max=e.k_max, random_state=seed), limit=60).fit(trace)
     ranges = images_of(trace)
     quality = learner.clusterer_.quality_
-    labelings = labels_by_k(learner.clusterer_, ReciprocalTransformer().fit_transform(ranges))
+    labelings = learner.clusterer_.labels_by_k_
     uncertainty = {k: uncertainty_coefficient(labels, truth) for k, labels in labelings.items()}
     starred = solve(trace.with_views(learner.views_.tolist()), WITH_STARS, limit=60)
     pairs = _aliased(learner.views_, truth)
