@@ -7,6 +7,7 @@ map that they give is looked at, too.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -92,6 +93,14 @@ def second_map(
     if {partition(m) for m in maps} & {partition(m) for m in solution.maps}:
         return None
     return SecondMap(len(set(trace.views)), len(set(other.views)), len(maps[0].dstates) if maps else None, solution)
+
+
+def warn_of_second_map(trace: Trace, maps: Sequence[SSHMap], theory: Theory | None, limit: float | None) -> SecondMap | None:
+    """The same, with a RunnerUpWarning where there is one."""
+    found = second_map(trace, maps, theory, limit)
+    if found:
+        warnings.warn(found.sentence, RunnerUpWarning, stacklevel=3)
+    return found
 
 
 def partition(ssh_map: SSHMap) -> tuple[tuple[int, ...], tuple[int | None, ...]]:

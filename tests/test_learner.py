@@ -10,9 +10,14 @@ import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from sklearn.base import clone
+from sklearn.cluster import DBSCAN, AgglomerativeClustering
+from sklearn.mixture import GaussianMixture
+from sklearn.model_selection import cross_val_score
 
 from perception.errors import ImageWarning, PerceptionError
 from perception.images import images_of
@@ -63,7 +68,7 @@ def test_the_hall_is_learnt_with_the_openings_seen(hall: Trace) -> None:
 
 
 def test_who_has_not_learnt_recognises_nothing() -> None:
-    assert repr(BootstrapLearner(choose=1)) == "BootstrapLearner(theory=None, clusterer=None, choose=1, limit=None)"
+    assert repr(BootstrapLearner(choose=1)) == "BootstrapLearner(choose=1)"
     with pytest.raises(LearnerError, match="call fit with a trace first"):
         BootstrapLearner().predict([[1.0, 2.0]])
 
@@ -112,10 +117,65 @@ def test_an_incomplete_list_of_maps_is_said() -> None:
 
 
 def test_other_clusterings_can_be_plugged_in(run: Trace) -> None:
-    from sklearn.cluster import AgglomerativeClustering
-
     clusterer = ViewClusterer(clusterer=AgglomerativeClustering(linkage="complete"), k_max=10)
     assert one_to_one(BootstrapLearner(VIEWS_ALONE, clusterer).fit(run).labels_, true_dstates(run))
+
+
+def test_the_learner_is_an_estimator(run: Trace, hall: Trace) -> None:
+    clusterer = ViewClusterer(k_max=6, random_state=0)
+    learner = BootstrapLearner(VIEWS_ALONE, clusterer, limit=20)
+    again = clone(learner).set_params(choose=0)
+    assert again.get_params()["clusterer__k_max"] == 6
+    assert (again.choose, learner.choose, again.theory) == (0, None, VIEWS_ALONE)
+    assert learner.fit(run) is learner
+    assert not hasattr(clusterer, "k_")  # it was cloned
+    assert learner.confidence_.shape == learner.labels_.shape == (len(run),)
+    assert learner.score(run) == learner.score(images_of(run), learner.labels_) == 1
+    other = simulate(World.named("notched-rectangle"), tours=2, seed=502)
+    assert 0.9 < learner.score(other) <= 1
+    np.testing.assert_array_equal(learner.predict(other), learner.predict(images_of(other)))
+    with pytest.raises(LearnerError, match="y: expected the dstates of the images, got none"):
+        learner.score(images_of(run))
+    with pytest.raises(LearnerError, match="y: expected 96 dstates, one an image"):
+        learner.score(run, [1, 2])
+    broken = replace(other, steps=(other.steps[0], replace(other.steps[1], image=other.steps[3].image), *other.steps[2:]))
+    with pytest.raises(LearnerError, match="expected some steps whose dstate the map tells, got none"):
+        learner.score(broken)
+    with pytest.raises(TraceError, match="traces: expected a Trace, or a list of them, got"):
+        BootstrapLearner().fit("run.jsonl")  # type: ignore[arg-type]
+    assert cross_val_score(BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)), [run, other, other], cv=3).min() > 0.85
+
+
+def test_several_traces_share_views_and_a_map(run: Trace) -> None:
+    short = simulate(World.named("notched-rectangle"), tours=2, seed=503)
+    late = replace(short, steps=short.steps[3:])  # begins at x3
+    learner = BootstrapLearner(VIEWS_ALONE).fit([late, run, short])
+    assert one_to_one(learner.labels_, np.concatenate([true_dstates(t) for t in (late, run, short)]))
+    assert (learner.solution_.steps, len(learner.labels_)) == (len(run), len(run) + len(short) + len(late))
+    broken = replace(short, steps=(short.steps[0], replace(short.steps[1], image=short.steps[3].image), *short.steps[2:]))
+    with pytest.warns(AmbiguousMapWarning, match="trace 1: the map of the longest trace does not tell where any of its 16 steps is"):
+        learner = BootstrapLearner(VIEWS_ALONE).fit([run, broken])
+    assert learner.labels_.tolist()[len(run) - 1 :] == [7] + [-1] * 16
+    narrow = replace(short, steps=tuple(replace(s, image=s.image[:90]) for s in short.steps))
+    with pytest.raises(PerceptionError, match="trace 1: image: expected 180 ranges, as trace 0 has, got 90"):
+        BootstrapLearner().fit([run, narrow])
+
+
+@pytest.mark.parametrize(
+    "clusterer",
+    [GaussianMixture(4, covariance_type="spherical", random_state=0), AgglomerativeClustering(n_clusters=None, distance_threshold=6.0)],
+)
+def test_clusterers_of_others_make_the_views(run: Trace, clusterer: Any) -> None:
+    assert one_to_one(BootstrapLearner(VIEWS_ALONE, clusterer).fit(run).labels_, true_dstates(run))
+
+
+def test_an_image_that_is_noise_is_not_learnt_from(run: Trace) -> None:
+    odd = replace(run, steps=(*run.steps[:-1], replace(run.steps[-1], image=tuple(0.7 * r for r in run.steps[-1].image))))
+    with pytest.warns(ImageWarning, match=r"1 of 96 images are like those of no view.*\(image 95\)"):
+        learner = BootstrapLearner(VIEWS_ALONE, DBSCAN(eps=1.5), limit=10).fit(odd)
+    assert (learner.views_[-1], learner.confidence_[-1], learner.labels_[-1]) == (-1, 0, -1)
+    assert (learner.labels_[:-1] >= 0).all()
+    assert set(learner.recogniser_.classes_) == set(learner.labels_[:-1].tolist())
 
 
 # Doubts about the number of views

@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 import tracemalloc
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -21,18 +22,20 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import pdist, squareform
 from sklearn.base import clone
-from sklearn.cluster import DBSCAN, AgglomerativeClustering, KMeans, MeanShift
+from sklearn.cluster import DBSCAN, HDBSCAN, AgglomerativeClustering, KMeans, MeanShift
 from sklearn.metrics import adjusted_rand_score, mutual_info_score
+from sklearn.mixture import BayesianGaussianMixture, GaussianMixture
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from perception import quality, store, views
+from perception.confidence import confidence, nearest_views, warn_of_doubts
 from perception.errors import ImageWarning, PerceptionError
 from perception.quality import cluster_quality, cluster_spread, spanning_tree, trimmed_quality, uncertainty_coefficient
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecognizer, learning_curve, recogniser
-from perception.views import ViewClusterer
+from perception.views import ViewClusterer, as_view_clusterer
 from ssh_abduction.errors import SSHError
 
 Images = np.ndarray[Any, Any]
@@ -322,6 +325,98 @@ def test_noise_is_no_view() -> None:
     assert found.k_ == 3
     assert found.labels_[-1] == -1
     assert found.predict(images[-1:]).tolist() == [-1]
+    assert found.quality_[3] == pytest.approx(plain_quality(images[:-1], found.labels_[:-1]))
+    assert found.confidence_[-1] == 0
+    assert found.confidence_[:-1].min() > 0.9
+    assert math.isnan(found.score(images[-1:]))
+
+
+@pytest.mark.parametrize(
+    ("clusterer", "tried"),
+    [
+        (GaussianMixture(covariance_type="diag", random_state=0), [2, 3, 4, 5, 6]),
+        (AgglomerativeClustering(n_clusters=None, distance_threshold=8.0), [4]),
+        (HDBSCAN(min_cluster_size=5, copy=True), [4]),
+    ],
+)
+def test_mixtures_and_thresholds_plug_in(clusterer: Any, tried: list[int]) -> None:
+    images, truth = blobs(4, 15)
+    found = ViewClusterer(clusterer=clusterer, k_max=6, random_state=0).fit(images)
+    assert (found.k_, list(found.quality_)) == (4, tried)
+    assert adjusted_rand_score(truth, found.labels_) == adjusted_rand_score(truth, found.predict(images + 0.01)) == 1
+    assert found.score(images) == pytest.approx(plain_quality(images, truth))
+    assert found.score(images + 0.3 * np.random.default_rng(0).normal(size=images.shape)) < found.score(images)
+    assert not hasattr(clusterer, "labels_")
+    assert not hasattr(clusterer, "means_")
+
+
+def test_a_given_clusterer_becomes_one_of_views() -> None:
+    images = blobs(4, 15)[0]
+    assert as_view_clusterer(GaussianMixture(3, random_state=0)).fit(images).k_ == 3
+    assert as_view_clusterer(DBSCAN(eps=1.0)).fit(images).k_ == 4
+    same = ViewClusterer(k=2)
+    assert as_view_clusterer(same) is same
+    with pytest.raises(PerceptionError, match="clusterer: expected a scikit-learn clusterer, such as DBSCAN"):
+        as_view_clusterer("k-means")
+    with pytest.raises(PerceptionError, match="k: AgglomerativeClustering finds the number of clusters itself"):
+        ViewClusterer(k=3, clusterer=AgglomerativeClustering(n_clusters=None, distance_threshold=1.0)).fit(images)
+
+
+def test_components_that_stay_empty_are_no_views() -> None:
+    images = np.repeat(np.arange(6.0)[:, None] // 2 * 5, 10, axis=0) + np.random.default_rng(0).normal(0, 0.1, (60, 2))
+    found = ViewClusterer(
+        clusterer=BayesianGaussianMixture(random_state=0, weight_concentration_prior=1e-3, covariance_type="spherical"), k_max=5
+    ).fit(images)
+    assert found.k_ == 3
+    assert all(len(set(labels.tolist())) == k for k, labels in found.labels_by_k_.items())
+
+
+# confidence
+
+
+def test_confidence_is_that_of_the_own_centre_against_the_next() -> None:
+    images, truth = blobs(3, 12)
+    sure = confidence(images, truth)
+    for i in (0, 7, 35):
+        others = [images[(truth == c) & (np.arange(36) != i)].mean(axis=0) for c in range(3)]
+        far = [float(np.linalg.norm(images[i] - centre)) for centre in others]
+        own, next_ = far[truth[i]], min(far[c] for c in range(3) if c != truth[i])
+        assert sure[i] == pytest.approx(next_**2 / (own**2 + next_**2))
+    assert sure.min() > 0.98
+    between = np.vstack([images, (images[truth == 0].mean(axis=0) + images[truth == 1].mean(axis=0)) / 2])
+    assert confidence(between, [*truth, 0])[-1] == pytest.approx(0.5, abs=0.03)
+    assert ViewClusterer(k=3, random_state=0).fit(images).confidence_.tolist() == sure.tolist()
+
+
+def test_confidence_where_nothing_tells() -> None:
+    images, truth = blobs(3, 12)
+    alone = np.vstack([images, np.full((1, 8), 40.0)])
+    assert confidence(alone, [*truth, 3])[-1] == 0.5
+    assert confidence(alone, [*truth, -1])[-1] == 0
+    assert nearest_views(alone, [*truth, -1]).tolist() == [*truth, 2]
+    assert confidence(alone, [0] * 36 + [-1]).tolist() == [1] * 36 + [0]
+    assert confidence(np.ones((4, 2)), [0, 0, 1, 1]).tolist() == [0.5] * 4  # all images are equal
+    with pytest.raises(PerceptionError, match="expected 36 whole numbers, one an image"):
+        confidence(images, truth[1:])
+    with pytest.raises(PerceptionError, match="expected some that are in a cluster, got 36 that are noise"):
+        nearest_views(images, [-1] * 36)
+
+
+def test_doubtful_images_and_views_are_said() -> None:
+    truth, sure = np.arange(60) % 3, np.full(60, 0.99)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_doubts(truth, sure, 3.0)
+    for index, label, certain in ((7, 9, 0.99), (8, 1, 0.6), (9, -1, 0.0)):
+        labels, trust = truth.copy(), sure.copy()
+        labels[index], trust[index] = label, certain
+        with pytest.warns(ImageWarning, match=rf"1 of 60 images are like those of no view.*\(image {index}\)"):
+            warn_of_doubts(labels, trust, 3.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_doubts([0, 1, 2, 2, 0, 3], [0.99, 0.5, 0.99, 0.99, 0.99, 0.5], 3.0)  # nearly all of it was seen once
+    with pytest.warns(ImageWarning, match=r"views overlap \(M is 0\.40, below 1\)"):
+        warn_of_doubts(truth, sure, 0.4)
 
 
 def test_equal_images_are_one_view() -> None:
@@ -557,7 +652,7 @@ def test_docstrings_run() -> None:
     import doctest
     import importlib
 
-    for name in ("quality", "reciprocal", "views", "recognition"):
+    for name in ("confidence", "quality", "reciprocal", "views", "recognition"):
         result = doctest.testmod(importlib.import_module(f"perception.{name}"))
         assert result.failed == 0
         assert result.attempted > 0

@@ -35,6 +35,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    from perception.confidence import warn_of_doubts
     from perception.images import images_of
     from perception.quality import uncertainty_coefficient
     from perception.reciprocal import ReciprocalTransformer
@@ -54,20 +55,21 @@ def run(options: argparse.Namespace) -> int:
     if truth is not None:
         uncertainty = {k: uncertainty_coefficient(labels, truth) for k, labels in clusterer.labels_by_k_.items()}
     beside = trace.images and os.path.relpath(Path(trace.source or ".").parent / trace.images, Path(options.output).parent)
-    other = clusterer.runner_up_
+    other = clusterer.runner_up_labels_
     clustered = replace(trace.with_views(clusterer.labels_.tolist()), images=beside)
-    clustered = with_runner_up(clustered, None if other is None else clusterer.labels_by_k_[other].tolist())
+    clustered = with_runner_up(clustered, None if other is None else other.tolist())
     rows = [
         [
             k,
             *("–" if math.isnan(m) else f"{m:.3f}" for m in (clusterer.quality_[k], clusterer.trimmed_[k])),
             *([f"{uncertainty[k]:.3f}"] if uncertainty else []),
-            {clusterer.k_: "chosen", other: "runner-up"}.get(k, ""),
+            {clusterer.k_: "chosen", clusterer.runner_up_: "runner-up"}.get(k, ""),
         ]
         for k in clusterer.quality_
     ]
     chosen = table(["k", "M", "trimmed", *(["U"] if uncertainty else []), ""], rows)
     write(clustered, options.output, f"{chosen}\n{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}")
+    warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
     warn(doubts(clustered))
     if options.plot:
         sys.stdout.flush()  # a picture that fails loses nothing of this
