@@ -33,9 +33,10 @@ from perception.quality import cluster_quality, sampled, spanning_tree, trimmed_
 MANY = 5_000
 # Where there are more than MANY images, k-means has at most this many rounds: once over the sample, and once over all images from the best centres of the sample.
 ROUNDS = 30
-# Another k is a doubt where trimmed M of the chosen one is less than so many times that of the other. In the worlds of the paper it is 1.7 times or more where M
-# chooses well; where M errs it is 1.4 at most, or trimmed M prefers the other (seeds 0 to 2 of the axes in docs/reproduction.md; the page has other seeds).
+# Another k is a doubt where trimmed M of the chosen one is less than so many times the largest of the others. docs/reproduction.md has a table of what that finds.
 NEAR = 1.5
+# Medians of trimmed M that differ by less than a twentieth do not tell two k apart: then the smaller one is preferred.
+EQUAL = 0.95
 
 
 class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
@@ -54,7 +55,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     n_init        the number of starts of k-means. For more than 5,000 images the starts are made on a random sample of 5,000, and the best one is refined over
                   all images, both in at most 30 rounds; a view that is too rare for the sample may then be missed
     random_state  seed, RandomState or None; if the clusterer has a seed of its own, that is used instead
-    by            "M", or "trimmed" for the k with the largest trimmed M
+    by            "M", or "trimmed" for the smallest k with a trimmed M of at least 0.95 times the largest
     trim          the share of distances that trimmed M leaves out at each end, in [0, 0.5]
 
     Attributes
@@ -65,7 +66,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     quality_          M for each k that was tried, noise left out; only one, where the clusterer finds k itself
     trimmed_          trimmed M for each k that was tried (perception.quality.trimmed_quality)
     labels_by_k_      the views, (n,), for each k that was tried
-    runner_up_        the other k with the largest trimmed M, where that of k_ is less than 1.5 times as large; None where there is no such doubt
+    runner_up_        what trimmed M chooses of the other k, where that of k_ is less than 1.5 times the largest of theirs; None where there is no such doubt
     cluster_centers_  (k, d), where the clusterer has centres
     clusterer_        the fitted clusterer; None where all images are equal
 
@@ -148,22 +149,21 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         most = min(20, len(images) - 1) if self.k_max is None else self.k_max
         most = min(max(most, self.k_min), tree.distinct)
         self._affordable(self.k_min, images, tree.distinct)
-        best, self.quality_, self.trimmed_, self.labels_by_k_ = None, {}, {}, {}
+        self.quality_, self.trimmed_, self.labels_by_k_ = {}, {}, {}
+        fitted: dict[int, Any] = {}
         for k in range(self.k_min, most + 1):
             tried = self._cluster(images, k, seed)
             labels = _labels(tried, images)
-            if best is not None and len(set(labels.tolist())) < k:
+            if fitted and len(set(labels.tolist())) < k:
                 continue  # a mixture left some of its components empty
-            self.labels_by_k_[k] = labels
+            fitted[k], self.labels_by_k_[k] = tried, labels
             self.quality_[k] = cluster_quality(images, labels, tree)
             self.trimmed_[k] = trimmed_quality(images[chosen], labels[chosen], self.trim, distances)
-            worth = self.trimmed_ if self.by == "trimmed" else self.quality_
-            if best is None or worth[k] > worth[self.k_]:
-                best, self.k_ = tried, k
-        other = max(self.trimmed_.keys() - {self.k_}, key=lambda k: (self.trimmed_[k], -k), default=None)
-        near = other is not None and self.trimmed_[self.k_] < NEAR * self.trimmed_[other]
-        self.runner_up_ = other if near else None
-        return best
+        self.k_ = _smallest_good(self.trimmed_) if self.by == "trimmed" else max(self.quality_, key=self.quality_.__getitem__)
+        others = {k: worth for k, worth in self.trimmed_.items() if k != self.k_}
+        near = bool(others) and self.trimmed_[self.k_] < NEAR * max(others.values())
+        self.runner_up_ = _smallest_good(others) if near else None
+        return fitted[self.k_]
 
     def _cluster(self, images: NDArray[np.float64], k: int | None, seed: int) -> Any:
         """A fitted clusterer for k views."""
@@ -240,6 +240,11 @@ def as_view_clusterer(clusterer: Any) -> ViewClusterer:
     checked._check()
     size = _size(clusterer)
     return checked if size is None else checked.set_params(k=clusterer.get_params()[size])
+
+
+def _smallest_good(worth: dict[int, float]) -> int:
+    """The smallest k whose trimmed M is EQUAL times the largest, or more."""
+    return min(k for k in worth if not worth[k] < EQUAL * max(worth.values()))
 
 
 def _size(clusterer: Any) -> str | None:

@@ -20,8 +20,11 @@ from sklearn.mixture import GaussianMixture
 from sklearn.model_selection import cross_val_score
 
 from perception.errors import ImageWarning, PerceptionError
+from perception.features import telling_features
 from perception.images import images_of
+from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
+from simulator.laser import BEARINGS, Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Step, Theory, Trace, solve
@@ -176,6 +179,44 @@ def test_an_image_that_is_noise_is_not_learnt_from(run: Trace) -> None:
     assert (learner.views_[-1], learner.confidence_[-1], learner.labels_[-1]) == (-1, 0, -1)
     assert (learner.labels_[:-1] >= 0).all()
     assert set(learner.recogniser_.classes_) == set(learner.labels_[:-1].tolist())
+
+
+# Which beams tell dstates apart
+
+
+def test_the_beams_that_tell_corners_apart_see_the_notch(run: Trace) -> None:
+    """The notch, or its edge within 15 cm: where the robot faces the notch, it stops at the same distance from it, and sees that the wall beside it is nearer."""
+    truth, images = true_dstates(run), ReciprocalTransformer().fit_transform(images_of(run))
+    poses = np.array([step.truth["pose"] for step in run.steps])
+    for i in range(4):
+        found = telling_features(images, truth, f"x{i}", f"x{i + 4}")
+        assert found.recognised == 1
+        here = truth == f"x{i}"
+        (ranges,), (x, y, heading) = Laser(noise=0).exact(World.named("notched-rectangle"), poses[here][:1]), poses[here][0]
+        for method, shares in found.methods.items():
+            beam = int(shares.argmax())
+            at = x + ranges[beam] * np.cos(heading + BEARINGS[beam]), y + ranges[beam] * np.sin(heading + BEARINGS[beam])
+            assert 2.45 < at[0] < 3.95, (i, method, at)
+            assert at[1] < 0.01, (i, method, at)
+
+
+def test_the_shell_tells_what_tells_dstates_apart(run: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    views, maps = tmp_path / "views.jsonl", tmp_path / "maps.json"
+    learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)).fit(run)
+    run.with_views(learner.views_.tolist()).save(views)
+    maps.write_text(json.dumps(learner.map_.to_dict()))
+    assert main(["tell-apart", str(views), str(maps), "--plot", str(tmp_path / "beams.png")]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert [line.split()[:3] for line in out[1:]] == [[f"{i},", str(i + 4), "1.000"] for i in range(4)]
+    assert (tmp_path / "beams.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["tell-apart", str(views), str(maps), "--dstates", "0,1", "--json"]) == 0
+    (told,) = json.loads(capsys.readouterr().out)
+    assert (told["dstates"], len(told["margin"]), sum(told["linear"])) == ([0, 1], 180, pytest.approx(1))
+    assert main(["tell-apart", str(views), str(maps), "--dstates", "0,99"]) == 1
+    assert "expected at least two images of 99, got 0" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["tell-apart", str(views), str(maps), "--dstates", "0"])
+    assert "expected two dstates with a comma between them" in capsys.readouterr().err
 
 
 # Doubts about the number of views

@@ -32,6 +32,7 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from perception import quality, store, views
 from perception.confidence import confidence, nearest_views, warn_of_doubts
 from perception.errors import ImageWarning, PerceptionError
+from perception.features import strongest, telling_features
 from perception.quality import cluster_quality, cluster_spread, spanning_tree, trimmed_quality, uncertainty_coefficient
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecognizer, learning_curve, recogniser
@@ -531,6 +532,39 @@ def test_learning_curves_that_cannot_be_drawn(arguments: dict[str, Any], message
         learning_curve(np.ones((6, 2)), [0, 0, 0, 1, 1, 1], **arguments)
 
 
+# what tells two dstates apart
+
+
+def test_the_feature_that_differs_tells_two_apart() -> None:
+    rng = np.random.default_rng(0)
+    labels = np.repeat([3, 8, 5], 20)
+    images = rng.normal(0, [0.1, 0.1, 2.0, 0.1], (60, 4))  # the third is loud, and tells nothing
+    images[labels == 8, 1] += 1
+    found = telling_features(images, labels, 3, 8)
+    for method, shares in found.methods.items():
+        assert (shares.argmax(), shares.sum()) == (1, pytest.approx(1)), method
+        assert (shares >= 0).all()
+    assert telling_features(images[:, [0, 1, 3]], labels, 3, 8).recognised == 1
+    assert telling_features(images, labels, 3, 5).recognised < 0.8
+    assert strongest(found.permutation) == "1"
+    assert (strongest([0.2, 0.2, 0.0, 0.15, 0.2, 0.25], 0.8), strongest([0.0, 0.0])) == ("0–1, 4–5", "–")
+    same = telling_features(np.ones((4, 3)), [0, 0, 1, 1], 0, 1)
+    assert [shares.tolist() for shares in same.methods.values()] == [[0, 0, 0]] * 3
+
+
+@pytest.mark.parametrize(
+    ("labels", "pair", "message"),
+    [
+        ([0, 0, 1, 1], (0, 0), "dstates: expected two different ones, got 0 twice"),
+        ([0, 0, 1, 2], (0, 1), "dstates: expected at least two images of 1, got 1"),
+        ([0, 1], (0, 1), "labels: expected 4, one an image"),
+    ],
+)
+def test_dstates_that_cannot_be_compared(labels: list[int], pair: tuple[int, int], message: str) -> None:
+    with pytest.raises(PerceptionError, match=message):
+        telling_features(np.eye(4), labels, *pair)
+
+
 # files
 
 
@@ -652,7 +686,7 @@ def test_docstrings_run() -> None:
     import doctest
     import importlib
 
-    for name in ("confidence", "quality", "reciprocal", "views", "recognition"):
+    for name in ("confidence", "features", "quality", "reciprocal", "views", "recognition"):
         result = doctest.testmod(importlib.import_module(f"perception.{name}"))
         assert result.failed == 0
         assert result.attempted > 0

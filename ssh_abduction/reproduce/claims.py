@@ -326,7 +326,7 @@ class Outcome:
 def outcome(notch: float, scale: float, seed: int = 0) -> Outcome:
     """Images of the notched rectangle with another notch: from the dstates that the robot found there, with its offsets scaled."""
     warnings.simplefilter("ignore", ImageWarning)
-    world = _notched(notch)
+    world = notched(notch)
     means, offsets, truth = _driven(notch, seed)
     rng, laser = np.random.default_rng(seed), Laser()
     scans = [laser.scan(world, means + scale * offsets, rng) for _ in range(STILL)]
@@ -346,7 +346,7 @@ def outcome(notch: float, scale: float, seed: int = 0) -> Outcome:
     )
 
 
-def _notched(depth: float) -> World:
+def notched(depth: float) -> World:
     """The notched rectangle with a notch of another depth, in metres."""
     world = World.named("notched-rectangle")
     segments = world.segments.copy()
@@ -357,7 +357,7 @@ def _notched(depth: float) -> World:
 @cache
 def _driven(notch: float, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
     """For each pose of 50 circuits: the mean pose at its dstate, (n, 3), how far it is off it, (n, 3), and the dstate."""
-    trace = simulate(_notched(notch), EXPERIMENTS["notched-rectangle"].tours, seed)
+    trace = simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, seed)
     truth = true_dstates(trace)
     poses = np.array([step.truth["pose"] for step in trace.steps])
     means = np.empty_like(poses)
