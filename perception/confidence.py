@@ -19,9 +19,9 @@ from perception.errors import ImageWarning, PerceptionError, equal_length
 NOISE = -1  # the label that clusterers give to an image that is in no cluster
 # An image with less confidence than this is said to be doubtful. Good images of the paper's worlds have 0.93 and more, those with somebody before the laser 0.5.
 SURE = 0.8
-# A view with one image, or at most this share of the images that the middle one has, is said to be doubtful, where the middle one was seen SEEN times: while a robot
-# explores, views that were seen once are nothing strange.
-RARE, SEEN = 0.1, 4
+# A view of FEW images or less, or of at most RARE times as many as the view of the middle image has, is said to be doubtful where that one has SEEN or more: while a
+# robot explores, views that were seen once are nothing strange.
+FEW, RARE, SEEN = 2, 0.1, 6
 # So many images are named at most.
 NAMED = 8
 
@@ -78,9 +78,10 @@ def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
     quality       M
     """
     of, certain = np.asarray(labels), np.asarray(sure)
-    views, number, counts = np.unique(of, return_inverse=True, return_counts=True)
-    size, usual = counts[number], float(np.median(counts[views != NOISE])) if (views != NOISE).any() else 0.0
-    rare = size <= (max(RARE * usual, 1) if usual >= SEEN else 0)
+    number, counts = np.unique(of, return_inverse=True, return_counts=True)[1:]
+    size = counts[number]
+    usual = float(np.median(size[of != NOISE])) if (of != NOISE).any() else 0.0
+    rare = size <= (max(RARE * usual, FEW) if usual >= SEEN else 0)
     doubtful = np.flatnonzero((of == NOISE) | rare | ((certain < SURE) & (size > 1)))
     if len(doubtful):
         named = ", ".join(map(str, doubtful[:NAMED].tolist())) + (", …" if len(doubtful) > NAMED else "")

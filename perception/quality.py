@@ -49,6 +49,8 @@ BATCH = 64
 BLOCK = 2048
 # Quantiles of distances are estimated on this many images, where there are more: the distances between all of these take 32 MB.
 SAMPLE = 2_000
+# Where the middle cluster has SEEN images or more, trimmed M takes no width from clusters of FEW images or less: strange images are often put together, however unlike.
+SEEN, FEW = 6, 2
 # So many pairs of images are recomputed from differences at once: with 180 ranges an image, the differences take 12 MB.
 GATHERED = 8192
 
@@ -107,7 +109,8 @@ def trimmed_quality(X: ArrayLike, labels: ArrayLike, trim: float = 0.5, distance
 
     In M, the smallest distance between clusters and the largest within one are each that of a single pair of images. Here two clusters are as far from each
     other as the `trim`-quantile of the distances between their images says, and a cluster is as wide as the (1 - `trim`)-quantile of the distances within it.
-    The result is the smallest of the former divided by the largest of the latter. Clusters of one image have no width.
+    The result is the smallest of the former divided by the largest of the latter. Clusters of one image have no width, and those of two are left out where others
+    are large.
 
     X          (n, d) images, finite; of more than 2,000 a fixed random sample is measured
     labels     (n,), where each value is one cluster
@@ -129,7 +132,9 @@ def trimmed_quality(X: ArrayLike, labels: ArrayLike, trim: float = 0.5, distance
     members = [np.flatnonzero(clusters == c) for c in np.unique(clusters)]
     if len(members) < 2:
         return 0.0  # the sample shows no gap
-    widths = [np.quantile(distances[np.ix_(m, m)][np.triu_indices(len(m), 1)], 1 - trim) for m in members if len(m) > 1]
+    usual = float(np.median([len(m) for m in members]))
+    wide = [m for m in members if len(m) > (FEW if usual >= SEEN else 1)]
+    widths = [np.quantile(distances[np.ix_(m, m)][np.triu_indices(len(m), 1)], 1 - trim) for m in wide]
     gaps = [np.quantile(distances[np.ix_(m, other)], trim) for i, m in enumerate(members) for other in members[:i]]
     between, within = float(min(gaps)), float(max(widths, default=0.0))
     return 0.0 if between == 0 else between / within if within > 0 else math.inf

@@ -35,6 +35,8 @@ MANY = 5_000
 ROUNDS = 30
 # Another k is a doubt where trimmed M of the chosen one is less than so many times the largest of the others. docs/reproduction.md has a table of what that finds.
 NEAR = 1.5
+# More views than the chosen ones are a doubt, too, where their trimmed M is at least this: few views may be far from each other, and each be several that are well apart.
+APART = 2.3
 # Medians of trimmed M that differ by less than a twentieth do not tell two k apart: then the smaller one is preferred.
 EQUAL = 0.95
 
@@ -66,7 +68,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     quality_          M for each k that was tried, noise left out; only one, where the clusterer finds k itself
     trimmed_          trimmed M for each k that was tried (perception.quality.trimmed_quality)
     labels_by_k_      the views, (n,), for each k that was tried
-    runner_up_        what trimmed M chooses of the other k, where that of k_ is less than 1.5 times the largest of theirs; None where there is no such doubt
+    runner_up_        what trimmed M chooses of the other k, where that of k_ is less than 1.5 times the largest of theirs; else the best larger k with a trimmed M of
+                      2.3 or more; None where there is no such doubt
     cluster_centers_  (k, d), where the clusterer has centres
     clusterer_        the fitted clusterer; None where all images are equal
 
@@ -160,10 +163,16 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             self.quality_[k] = cluster_quality(images, labels, tree)
             self.trimmed_[k] = trimmed_quality(images[chosen], labels[chosen], self.trim, distances)
         self.k_ = _smallest_good(self.trimmed_) if self.by == "trimmed" else max(self.quality_, key=self.quality_.__getitem__)
-        others = {k: worth for k, worth in self.trimmed_.items() if k != self.k_}
-        near = bool(others) and self.trimmed_[self.k_] < NEAR * max(others.values())
-        self.runner_up_ = _smallest_good(others) if near else None
+        self.runner_up_ = self._doubted()
         return fitted[self.k_]
+
+    def _doubted(self) -> int | None:
+        """The number of views that is a reason to doubt the chosen one."""
+        others = {k: worth for k, worth in self.trimmed_.items() if k != self.k_}
+        if others and self.trimmed_[self.k_] < NEAR * max(others.values()):
+            return _smallest_good(others)
+        finer = {k: worth for k, worth in others.items() if k > self.k_ and worth >= APART}
+        return max(finer, key=finer.__getitem__, default=None)
 
     def _cluster(self, images: NDArray[np.float64], k: int | None, seed: int) -> Any:
         """A fitted clusterer for k views."""

@@ -51,7 +51,7 @@ class SecondMap:
         else:
             other = "have no map" if self.solution.status is Status.UNSATISFIABLE else "have no map that was found in time"
         return (
-            f"{self.views} views may be too {'few' if self.views < self.other_views else 'many'}: {self.other_views} separate the images about as well, "
+            f"{self.views} views may be too {'few' if self.views < self.other_views else 'many'}: {self.other_views} also separate the images well, "
             f"and {other}; cluster the images into {self.other_views} views to see it (--k {self.other_views}), or log more images"
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import inspect
 import io
 import json
@@ -233,16 +234,18 @@ def large_room() -> Trace:
 
 
 def test_another_map_of_the_runner_up_is_said(large_room: Trace) -> None:
-    with pytest.warns(RunnerUpWarning, match="2 views may be too few: 4 separate .* another map, of 8 dstates instead of 6; cluster"):
+    with pytest.warns(RunnerUpWarning, match="2 views may be too few: 4 also separate .* another map, of 8 dstates instead of 6; cluster"):
         learner = BootstrapLearner().fit(large_room)
     assert (learner.clusterer_.k_, learner.clusterer_.runner_up_, len(learner.map_.dstates)) == (2, 4, 6)
-    with pytest.warns(RunnerUpWarning, match="4 views may be too many: 2 separate"):
+    with pytest.warns(RunnerUpWarning, match="4 views may be too many: 2 also separate"):
         trimmed = BootstrapLearner(clusterer=ViewClusterer(by="trimmed", k_max=6, random_state=0)).fit(large_room)
     assert len(trimmed.map_.dstates) == 8
 
 
 def test_the_shell_says_it_too(large_room: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = "ssh-abduction: warning: 2 views may be too few: 4 separate the images about as well, and give another map, of 8 dstates instead of 6"
+    said = (
+        "ssh-abduction: warning: 2 views may be too few: 4 also separate the images well, and give another map, of 8 dstates instead of 6"
+    )
     run, views = str(tmp_path / "run.jsonl"), str(tmp_path / "views.jsonl")
     large_room.save(run)
     assert main(["cluster", run, "-o", views, "--k-max", "6"]) == 0
@@ -279,7 +282,7 @@ def test_a_runner_up_is_whole_or_wrong() -> None:
     found = second_map(with_runner_up(trace, "aaa"), solve(trace, Theory.causal()).maps, Theory.causal())
     assert found is not None
     assert found.sentence.startswith(
-        "2 views may be too many: 1 separate the images about as well, and give another map, of 1 dstates instead of 2"
+        "2 views may be too many: 1 also separate the images well, and give another map, of 1 dstates instead of 2"
     )
 
 
@@ -360,6 +363,8 @@ def test_the_claims_are_those_of_the_paper() -> None:
         assert str(e.views) in papers
         assert f"{e.dstates}, {e.places}, {e.paths}" in papers
         assert "100 %" in papers
+    (higher,) = (c for c in claims("taylor-hall") if c.text.startswith("higher k would still have been free of variability"))
+    assert (higher.paper, higher.ours) == ("above 10", False)
 
 
 def test_recognition_by_poor_labels_is_poor(run: Trace) -> None:
@@ -472,6 +477,10 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     page = (tmp_path / "report.html").read_text()
     for name in ("world.png", "learning.png", "map.svg"):
         assert f'src="{name}"' in page
+    assert [f"Figure {number}: " in page for number in (1, 2, 3, 4, 5)] == [False, True, True, True, False]
+    assert "the paper's room has its notch at a corner; here it is a recess in a wall" in html.unescape(page)
+    assert page.count("class='ours'") == sum(claim.ours for claim in claims("notched-rectangle")) == 5
+    assert "ours: errors do not add up" in out
     configuration = json.loads((tmp_path / "configuration.json").read_text())
     assert configuration["seeds"] == [500]
     assert configuration["versions"]["clingo"]

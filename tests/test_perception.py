@@ -269,11 +269,12 @@ def test_the_runner_up_is_what_trimmed_m_likes_about_as_well() -> None:
     """Two pairs of clusters, each pair near each other: the farther they are, the less doubt there is that there are four."""
     rng = np.random.default_rng(0)
     found = {}
-    for gap in (0.5, 1.1, 4.0):
+    for gap in (0.3, 0.5, 1.1, 4.0):
         images = np.concatenate([rng.normal(c, 0.1, (15, 6)) for c in (0, gap, 8, 8 + gap)])
         found[gap] = ViewClusterer(k_max=6, random_state=0).fit(images)
-    assert [(f.k_, f.runner_up_) for f in found.values()] == [(2, None), (2, 4), (4, None)]
-    assert [max(f.trimmed_, key=f.trimmed_.__getitem__) for f in found.values()] == [2, 4, 4]
+    assert [(f.k_, f.runner_up_) for f in found.values()] == [(2, None), (2, 4), (2, 4), (4, None)]
+    assert found[0.5].trimmed_[2] > 3 * found[0.5].trimmed_[4] > 3 * 2.3  # four are well apart, too, though two are much farther
+    assert found[1.1].runner_up_labels_ is found[1.1].labels_by_k_[4]
     assert found[1.1].labels_by_k_.keys() == found[1.1].trimmed_.keys() == found[1.1].quality_.keys()
     spoilt = images.copy()
     spoilt[0, 0] += 4  # one beam of one image, as far off as the next cluster: M makes a view of that image
