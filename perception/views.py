@@ -14,47 +14,62 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist
 from sklearn.base import BaseEstimator, ClusterMixin, clone
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
+from sklearn.mixture import BayesianGaussianMixture, GaussianMixture
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 from threadpoolctl import threadpool_limits
 
+from perception.confidence import NOISE, confidence
 from perception.errors import ImageWarning, PerceptionError, equal_length
-from perception.quality import cluster_quality, spanning_tree
+from perception.quality import cluster_quality, sampled, spanning_tree, trimmed_quality
 
 # Up to this many images all starts of k-means are made on all images. Where there are more, the starts are made on a sample of this many, so that the time for
 # them does not grow any further.
 MANY = 5_000
 # Where there are more than MANY images, k-means has at most this many rounds: once over the sample, and once over all images from the best centres of the sample.
 ROUNDS = 30
-
-
-def labels_by_k(clusterer: ViewClusterer, images: ArrayLike) -> dict[int, NDArray[np.intp]]:
-    """The views of the images, (n,), for each k that a fitted clusterer tried. They are clustered again with each k but the chosen one."""
-    return {k: clusterer.labels_ if k == clusterer.k_ else clone(clusterer).set_params(k=k).fit(images).labels_ for k in clusterer.quality_}
+# Another k is a doubt where trimmed M of the chosen one is less than so many times the largest of the others. docs/reproduction.md has a table of what that finds.
+NEAR = 1.5
+# More views than the chosen ones are a doubt, too, where their trimmed M is at least this: few views may be far from each other, and each be several that are well apart.
+APART = 2.3
+# Medians of trimmed M that differ by less than a twentieth do not tell two k apart: then the smaller one is preferred.
+EQUAL = 0.95
 
 
 class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     """Clusters images, (n, d), into k views. If k is not given, it is the number in [k_min, k_max] with the largest M (eq. 5), or the smallest of several.
 
+    M stands on two distances, and one lost beam can change these. So each k also has a trimmed M, and the number of views that this prefers, or nearly does, is
+    the runner-up: a reason to look at the map that its views give, too.
+
     Parameters
     ----------
     k             number of views, or None to choose it by M
     k_min, k_max  the range of k that is searched; k_max None stands for the smaller of 20 and n - 1. No k is larger than the number of different images
-    clusterer     None for k-means, or any scikit-learn clusterer. It is cloned, and its `n_clusters` is set to k. A clusterer without that parameter
-                  (DBSCAN, HDBSCAN) is used as it is, and finds k itself
+    clusterer     None for k-means, or any scikit-learn clusterer or mixture. It is cloned, and its `n_clusters` or `n_components` is set to k. A clusterer
+                  without these (DBSCAN, HDBSCAN), or one in which n_clusters is None (AgglomerativeClustering with a distance_threshold), is used as it is,
+                  and finds k itself
     n_init        the number of starts of k-means. For more than 5,000 images the starts are made on a random sample of 5,000, and the best one is refined over
                   all images, both in at most 30 rounds; a view that is too rare for the sample may then be missed
     random_state  seed, RandomState or None; if the clusterer has a seed of its own, that is used instead
+    by            "M", or "trimmed" for the smallest k with a trimmed M of at least 0.95 times the largest
+    trim          the share of distances that trimmed M leaves out at each end, in [0, 0.5]
 
     Attributes
     ----------
     labels_           (n,) views of the fitted images; -1 where the clusterer says that an image is noise
     k_                how many views there are, noise not counted
-    quality_          M for each k that was tried; for a clusterer without `n_clusters` M of its result (noise counts as a cluster)
+    confidence_       (n,) how sure each view is, in [0, 1]; 0 for noise (perception.confidence)
+    quality_          M for each k that was tried, noise left out; only one, where the clusterer finds k itself
+    trimmed_          trimmed M for each k that was tried (perception.quality.trimmed_quality)
+    labels_by_k_      the views, (n,), for each k that was tried
+    runner_up_        what trimmed M chooses of the other k, where that of k_ is less than 1.5 times the largest of theirs; else the best larger k with a trimmed M of
+                      2.3 or more; None where there is no such doubt
     cluster_centers_  (k, d), where the clusterer has centres
     clusterer_        the fitted clusterer; None where all images are equal
 
@@ -70,6 +85,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         clusterer: Any = None,
         n_init: int = 10,
         random_state: int | np.random.RandomState | None = None,
+        by: str = "M",
+        trim: float = 0.5,
     ) -> None:
         self.k = k
         self.k_min = k_min
@@ -77,6 +94,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         self.clusterer = clusterer
         self.n_init = n_init
         self.random_state = random_state
+        self.by = by
+        self.trim = trim
 
     def fit(self, X: ArrayLike, y: Any = None) -> Self:
         self._check()
@@ -84,16 +103,14 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         if (images == images[0]).all():
             return self._one_view(images)
         seed = int(check_random_state(self.random_state).randint(2**31 - 1))
-        if self.clusterer is not None and "n_clusters" not in self.clusterer.get_params():
+        if self.clusterer is not None and _size(self.clusterer) is None:
             best = self._cluster(images, None, seed)
-            self.k_ = len(set(best.labels_.tolist()) - {-1})
-            self.quality_ = {self.k_: cluster_quality(images, best.labels_)}
+            self._tell(best, images)
         elif self.k is not None:
             if self.k > 1:
                 self._affordable(self.k, images)
             best = self._cluster(images, self.k, seed)
-            self.k_ = self.k
-            self.quality_ = {self.k: cluster_quality(images, best.labels_)}
+            self._tell(best, images)
         else:
             best = self._search(images, seed)
         return self._keep(best, images)
@@ -108,19 +125,54 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             return np.zeros(len(images), np.intp)
         return np.asarray((self.clusterer_ if self.nearest_ is None else self.nearest_).predict(images), np.intp)
 
+    def score(self, X: ArrayLike, y: Any = None) -> float:
+        """M of the views of images, (n, d), as `predict` gives them; larger is better. NaN where they have one view."""
+        views, images = self.predict(X), np.asarray(X, float)
+        return cluster_quality(images[views != NOISE], views[views != NOISE]) if (views != NOISE).any() else math.nan
+
+    @property
+    def runner_up_labels_(self) -> NDArray[np.intp] | None:
+        """The views of the runner-up, (n,), where there is one."""
+        return None if self.runner_up_ is None else self.labels_by_k_[self.runner_up_]
+
+    def _tell(self, best: Any, images: NDArray[np.float64]) -> None:
+        """Take down a clustering that has no rival."""
+        labels = _labels(best, images)
+        inside = labels != NOISE
+        self.k_ = len(set(labels[inside].tolist()))
+        self.runner_up_: int | None = None
+        self.quality_ = {self.k_: cluster_quality(images[inside], labels[inside]) if inside.any() else math.nan}
+        self.trimmed_ = {self.k_: trimmed_quality(images[inside], labels[inside], self.trim) if inside.any() else math.nan}
+        self.labels_by_k_ = {self.k_: labels}
+
     def _search(self, images: NDArray[np.float64], seed: int) -> Any:
-        """A fitted clusterer for the k with the largest M. Sets k_ and quality_."""
-        tree = spanning_tree(images)
+        """A fitted clusterer for the k with the largest M. Sets what is told of each k."""
+        tree, chosen = spanning_tree(images), sampled(len(images))
+        distances = cdist(images[chosen], images[chosen])
         most = min(20, len(images) - 1) if self.k_max is None else self.k_max
         most = min(max(most, self.k_min), tree.distinct)
         self._affordable(self.k_min, images, tree.distinct)
-        best, self.quality_, self.k_ = None, {}, 0
+        self.quality_, self.trimmed_, self.labels_by_k_ = {}, {}, {}
+        fitted: dict[int, Any] = {}
         for k in range(self.k_min, most + 1):
             tried = self._cluster(images, k, seed)
-            self.quality_[k] = cluster_quality(images, tried.labels_, tree)
-            if best is None or self.quality_[k] > self.quality_[self.k_]:
-                best, self.k_ = tried, k
-        return best
+            labels = _labels(tried, images)
+            if fitted and len(set(labels.tolist())) < k:
+                continue  # a mixture left some of its components empty
+            fitted[k], self.labels_by_k_[k] = tried, labels
+            self.quality_[k] = cluster_quality(images, labels, tree)
+            self.trimmed_[k] = trimmed_quality(images[chosen], labels[chosen], self.trim, distances)
+        self.k_ = _smallest_good(self.trimmed_) if self.by == "trimmed" else max(self.quality_, key=self.quality_.__getitem__)
+        self.runner_up_ = self._doubted()
+        return fitted[self.k_]
+
+    def _doubted(self) -> int | None:
+        """The number of views that is a reason to doubt the chosen one."""
+        others = {k: worth for k, worth in self.trimmed_.items() if k != self.k_}
+        if others and self.trimmed_[self.k_] < NEAR * max(others.values()):
+            return _smallest_good(others)
+        finer = {k: worth for k, worth in others.items() if k > self.k_ and worth >= APART}
+        return max(finer, key=finer.__getitem__, default=None)
 
     def _cluster(self, images: NDArray[np.float64], k: int | None, seed: int) -> Any:
         """A fitted clusterer for k views."""
@@ -129,7 +181,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         chosen = clone(self.clusterer)
         settings = chosen.get_params()
         if k is not None:
-            chosen.set_params(n_clusters=k)
+            chosen.set_params(**{str(_size(chosen)): k})
         if "random_state" in settings and settings["random_state"] is None and self.random_state is not None:
             chosen.set_params(random_state=seed)
         return chosen.fit(images)
@@ -149,7 +201,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
     def _keep(self, best: Any, images: NDArray[np.float64]) -> Self:
         self.clusterer_ = best
-        self.labels_ = np.asarray(best.labels_, np.intp)
+        self.labels_ = _labels(best, images)
+        self.confidence_ = confidence(images, self.labels_)
         self.nearest_ = None if hasattr(best, "predict") else KNeighborsClassifier(1, algorithm="brute").fit(images, self.labels_)
         if hasattr(best, "cluster_centers_"):
             self.cluster_centers_ = best.cluster_centers_
@@ -160,8 +213,9 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     def _one_view(self, images: NDArray[np.float64]) -> Self:
         warnings.warn(f"all {len(images)} images are equal: they are taken as one view", ImageWarning, stacklevel=3)
         self.clusterer_ = self.nearest_ = None
-        self.labels_, self.k_, self.quality_ = np.zeros(len(images), np.intp), 1, {1: math.nan}
-        self.cluster_centers_ = images[:1].copy()
+        self.labels_, self.k_, self.runner_up_ = np.zeros(len(images), np.intp), 1, None
+        self.quality_, self.trimmed_, self.labels_by_k_ = {1: math.nan}, {1: math.nan}, {1: self.labels_}
+        self.cluster_centers_, self.confidence_ = images[:1].copy(), np.ones(len(images))
         return self
 
     def _check(self) -> None:
@@ -171,11 +225,13 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 continue
             if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
                 raise PerceptionError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+        if self.by not in ("M", "trimmed"):
+            raise PerceptionError(f'by: expected "M" or "trimmed", got {self.by!r}')
         if self.k is None and self.k_max is not None and self.k_max < self.k_min:
             raise PerceptionError(f"k_max: expected at least k_min = {self.k_min}, got {self.k_max}")
         if self.clusterer is not None and not (hasattr(self.clusterer, "fit") and hasattr(self.clusterer, "get_params")):
             raise PerceptionError(f"clusterer: expected a scikit-learn clusterer, such as DBSCAN(), got {self.clusterer!r}")
-        if self.k is not None and self.clusterer is not None and "n_clusters" not in self.clusterer.get_params():
+        if self.k is not None and self.clusterer is not None and _size(self.clusterer) is None:
             raise PerceptionError(f"k: {type(self.clusterer).__name__} finds the number of clusters itself; leave k out")
 
     def _affordable(self, k: int, images: NDArray[np.float64], distinct: int | None = None) -> None:
@@ -183,3 +239,31 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         found = len(np.unique(images, axis=0)) if distinct is None else distinct
         if found < k:
             raise PerceptionError(f"k: expected at most {found}, as there are {found} different images among {len(images)}, got {k}")
+
+
+def as_view_clusterer(clusterer: Any) -> ViewClusterer:
+    """A ViewClusterer for one of scikit-learn's clusterers: it makes as many views as that one is set to. A ViewClusterer, as it is."""
+    if isinstance(clusterer, ViewClusterer):
+        return clusterer
+    checked = ViewClusterer(clusterer=clusterer)
+    checked._check()
+    size = _size(clusterer)
+    return checked if size is None else checked.set_params(k=clusterer.get_params()[size])
+
+
+def _smallest_good(worth: dict[int, float]) -> int:
+    """The smallest k whose trimmed M is EQUAL times the largest, or more."""
+    return min(k for k in worth if not worth[k] < EQUAL * max(worth.values()))
+
+
+def _size(clusterer: Any) -> str | None:
+    """The parameter of a clusterer that says how many clusters there are to be; None where it finds that out itself."""
+    settings = clusterer.get_params()
+    if settings.get("n_clusters") is not None:
+        return "n_clusters"
+    return "n_components" if isinstance(clusterer, GaussianMixture | BayesianGaussianMixture) else None
+
+
+def _labels(fitted: Any, images: NDArray[np.float64]) -> NDArray[np.intp]:
+    """The cluster of each image that was fitted, (n,). Mixtures predict it."""
+    return np.asarray(fitted.labels_ if hasattr(fitted, "labels_") else fitted.predict(images), np.intp)

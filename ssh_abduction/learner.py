@@ -9,101 +9,87 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, clone
 
-from perception.images import images_of
+from perception.confidence import warn_of_doubts
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import recogniser
-from perception.views import ViewClusterer
-from ssh_abduction.errors import SSHError
-from ssh_abduction.maps import SSHMap
+from perception.views import ViewClusterer, as_view_clusterer
+from ssh_abduction.labels import AmbiguousMapWarning, LearnerError, labels_of, labels_of_all, labels_on, map_of
+from ssh_abduction.runner_up import RunnerUpWarning, warn_of_second_map
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory, checked_theory
-from ssh_abduction.trace import Trace, checked_trace
+from ssh_abduction.trace import Trace
+from ssh_abduction.traces import Traces
+
+__all__ = ["AmbiguousMapWarning", "BootstrapLearner", "LearnerError", "RunnerUpWarning", "labels_of"]
 
 
-class LearnerError(SSHError):
-    """The loop cannot be closed: there is no map, or the maps agree on no label."""
-
-
-class AmbiguousMapWarning(UserWarning):
-    """Several minimal maps remain: only the labels that they agree on are learnt from."""
-
-
-class BootstrapLearner:
-    """Learns to recognise places from a trace of images and actions, without being told any place.
+class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
+    """Learns to recognise places from a trace of images and actions, without being told any place. An estimator, as scikit-learn has them.
 
     theory     the axioms; Theory.topological() by default
-    clusterer  makes views of images; ViewClusterer(random_state=0) by default
+    clusterer  makes views of images: a ViewClusterer, or a clusterer of scikit-learn's. It is cloned. ViewClusterer(random_state=0) by default
     choose     the index of the map to take where several remain; None takes the labels on which all of them agree
     limit      seconds for finding the map
 
-    After `fit` there are clusterer_, views_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree, and recogniser_.
+    After `fit` there are clusterer_, views_ and confidence_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree or an image has no view,
+    recogniser_, and second_map_, the map of the runner-up, where another number of views is about as good and gives another map.
+
+    Of several traces all images make the views, the longest trace makes the map, and the others are followed on it; n counts their steps, one after the other.
     """
 
     def __init__(self, theory: Theory | None = None, clusterer: Any = None, choose: int | None = None, limit: float | None = None) -> None:
-        self.theory = theory
-        self.clusterer = clusterer
-        self.choose = choose
-        self.limit = limit
+        self.theory, self.clusterer, self.choose, self.limit = theory, clusterer, choose, limit
 
-    def __repr__(self) -> str:
-        return f"BootstrapLearner(theory={self.theory!r}, clusterer={self.clusterer!r}, choose={self.choose}, limit={self.limit})"
-
-    def fit(self, trace: Trace) -> BootstrapLearner:
-        """Run the loop. Raises LearnerError, PerceptionError, TraceError."""
-        theory = checked_theory(self.theory)
-        images = images_of(checked_trace(trace))
-        self.clusterer_ = self.clusterer or ViewClusterer(random_state=0)
-        self.views_ = self.clusterer_.fit(ReciprocalTransformer().fit_transform(images)).labels_
-        self.solution_ = solve(trace.with_views(self.views_.tolist()), theory, limit=self.limit)
-        self.labels_ = labels_of(self.solution_.maps, self.choose, self.solution_.complete)
-        self.map_ = self.solution_.maps[self.choose or 0]
+    def fit(self, X: Trace | Sequence[Trace], y: Any = None) -> BootstrapLearner:
+        """Run the loop on a trace, or on several. Raises LearnerError, PerceptionError, TraceError."""
+        traces, theory = Traces.of(X), checked_theory(self.theory)
+        seen = self._look(traces)
+        self.solution_ = solve(seen.each[seen.longest], theory, limit=self.limit)
+        self.map_, mapped = map_of(self.solution_, self.choose)
+        self.second_map_ = warn_of_second_map(seen.each[seen.longest], self.solution_.maps, theory, self.limit)
+        self.labels_ = labels_of_all(self.map_, mapped, seen, self.views_)
         sure = self.labels_ >= 0
-        self.recogniser_ = recogniser().fit(images[sure], self.labels_[sure])
+        self.recogniser_ = recogniser().fit(traces.images[sure], self.labels_[sure])
         return self
 
-    def predict(self, images: ArrayLike) -> NDArray[np.intp]:
-        """The dstates, ids of `map_`, at which images (m, d) were taken. Raises LearnerError before `fit`."""
+    def predict(self, X: Trace | Sequence[Trace] | ArrayLike) -> NDArray[np.intp]:
+        """The dstates, ids of `map_`, at which images (m, d), or those of traces, were taken. Raises LearnerError before `fit`."""
         if not hasattr(self, "recogniser_"):
             raise LearnerError("learner: expected one that has learnt, got a new one; call fit with a trace first")
-        return np.asarray(self.recogniser_.predict(images), np.intp)
+        return np.asarray(self.recogniser_.predict(Traces.of(X).images if Traces.are(X) else X), np.intp)
 
+    def score(self, X: Trace | Sequence[Trace] | ArrayLike, y: ArrayLike | None = None) -> float:
+        """The share of images that are recognised: as the dstates `y` (m,), or, where these are not given, as those on the way of each trace on the map.
 
-def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool = True) -> NDArray[np.intp]:
-    """The label of each step, (n,): its dstate in the chosen map; or, if none is chosen, in the first map, and -1 where the maps disagree.
+        Of the ways that no view contradicts it is the one that fits most images. Steps at which it does not tell the dstate do not count. Raises LearnerError
+        where there is none at which it does.
+        """
+        found = self.predict(X)
+        if y is None and not Traces.are(X):
+            raise LearnerError("y: expected the dstates of the images, got none; give them, or traces, which are followed on the map")
+        true = np.asarray(self._followed(Traces.of(X), found) if y is None else y)
+        if true.shape != found.shape:
+            raise LearnerError(f"y: expected {len(found)} dstates, one an image, got an array of shape {true.shape}")
+        if not (true >= 0).any():
+            raise LearnerError("traces: expected some steps whose dstate the map tells, got none; score a trace of the same world")
+        return float(np.mean(found[true >= 0] == true[true >= 0]))
 
-    Maps agree on a step if the first step at its dstate is the same in all of them. Warns if no map is chosen and they do not agree
-    everywhere, or if there may be more (`complete` is false). Raises LearnerError where no map or no label is left.
-    """
-    if not maps:
-        raise LearnerError("maps: expected at least one to take labels from, got none; see the solution's status")
-    if choose is not None and not 0 <= choose < len(maps):
-        raise LearnerError(f"map: expected an index from 0 to {len(maps) - 1}, got {choose}")
-    labels = np.array(maps[choose or 0].labels, np.intp)
-    if choose is not None:
-        return labels
-    for i, ssh_map in enumerate(maps):
-        if len(ssh_map.labels) != len(labels):
-            raise LearnerError(
-                f"maps: expected maps of one trace, {len(labels)} labels each, got {len(ssh_map.labels)} in map {i + 1}; solve one trace"
-            )
-    first = [_first_steps(ssh_map) for ssh_map in maps]
-    agreed = np.all([f == first[0] for f in first], axis=0)
-    if not agreed.all() or not complete:
-        unsure = f"{len(maps)} minimal maps{'' if complete else ' or more'} remain, and agree on {agreed.sum()} of {len(agreed)} labels"
-        warnings.warn(f"{unsure}: only these are learnt from; choose a map, or explore more", AmbiguousMapWarning, stacklevel=2)
-    if not agreed.any():
-        raise LearnerError("labels: expected some that all maps agree on, got none; choose a map")
-    return np.where(agreed, labels, -1)
+    def _look(self, traces: Traces) -> Traces:
+        """The traces with their views, and, where there is one, with those of the runner-up."""
+        images = ReciprocalTransformer().fit_transform(traces.images)
+        self.clusterer_ = as_view_clusterer(ViewClusterer(random_state=0) if self.clusterer is None else clone(self.clusterer)).fit(images)
+        self.views_, self.confidence_ = self.clusterer_.labels_, self.clusterer_.confidence_
+        warn_of_doubts(self.views_, self.confidence_, self.clusterer_.quality_[self.clusterer_.k_])
+        return traces.with_views(images, self.views_, self.clusterer_.runner_up_labels_)
 
-
-def _first_steps(ssh_map: SSHMap) -> NDArray[np.intp]:
-    """For each step, (n,), the first step at its dstate."""
-    _, first, dstates = np.unique(ssh_map.labels, return_index=True, return_inverse=True)
-    return np.asarray(first[dstates], np.intp)
+    def _followed(self, traces: Traces, looks: NDArray[np.intp]) -> NDArray[np.intp]:
+        """The dstate of each step, by the map: -1 where it does not tell. `looks` are the dstates that the images look like."""
+        views = self.clusterer_.predict(ReciprocalTransformer().fit_transform(traces.images))
+        return labels_on(self.map_, traces, views, looks)

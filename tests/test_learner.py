@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import inspect
 import io
 import json
@@ -10,21 +11,31 @@ import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from sklearn.base import clone
+from sklearn.cluster import DBSCAN, AgglomerativeClustering
+from sklearn.mixture import GaussianMixture
+from sklearn.model_selection import cross_val_score
 
 from perception.errors import ImageWarning, PerceptionError
+from perception.features import telling_features
 from perception.images import images_of
+from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
+from simulator.laser import BEARINGS, Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Step, Theory, Trace, solve
 from ssh_abduction import learner as learner_module
 from ssh_abduction.cli import main
+from ssh_abduction.errors import TraceError
 from ssh_abduction.judge.checker import check
-from ssh_abduction.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, labels_of
+from ssh_abduction.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning, labels_of
 from ssh_abduction.reproduce.claims import EXPERIMENTS, claims, one_to_one, outcome, rate, summary, true_dstates
+from ssh_abduction.runner_up import runner_up, second_map, with_runner_up
 
 VIEWS_ALONE = Theory.topological().replace(star="none")
 
@@ -61,7 +72,7 @@ def test_the_hall_is_learnt_with_the_openings_seen(hall: Trace) -> None:
 
 
 def test_who_has_not_learnt_recognises_nothing() -> None:
-    assert repr(BootstrapLearner(choose=1)) == "BootstrapLearner(theory=None, clusterer=None, choose=1, limit=None)"
+    assert repr(BootstrapLearner(choose=1)) == "BootstrapLearner(choose=1)"
     with pytest.raises(LearnerError, match="call fit with a trace first"):
         BootstrapLearner().predict([[1.0, 2.0]])
 
@@ -97,18 +108,182 @@ def test_where_maps_disagree_nothing_is_learnt_unless_one_is_chosen() -> None:
 
 def test_an_incomplete_list_of_maps_is_said() -> None:
     maps = solve(Trace.from_steps("aba", ["travel", "travel"])).maps
-    with pytest.warns(AmbiguousMapWarning, match="1 minimal maps or more remain"):
+    with pytest.warns(AmbiguousMapWarning, match="at least 1 minimal map remains, and agree"):
         labels_of(maps, complete=False)
+    with pytest.warns(AmbiguousMapWarning) as caught:
+        labels_of(maps, complete=False, proven=False)
+    assert [str(w.message).split(":")[0] for w in caught] == [
+        f"the map of {len(maps[0].dstates)} dstates is the best that was found, and not proven minimal"
+    ]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         labels_of(maps)
 
 
 def test_other_clusterings_can_be_plugged_in(run: Trace) -> None:
-    from sklearn.cluster import AgglomerativeClustering
-
     clusterer = ViewClusterer(clusterer=AgglomerativeClustering(linkage="complete"), k_max=10)
     assert one_to_one(BootstrapLearner(VIEWS_ALONE, clusterer).fit(run).labels_, true_dstates(run))
+
+
+def test_the_learner_is_an_estimator(run: Trace, hall: Trace) -> None:
+    clusterer = ViewClusterer(k_max=6, random_state=0)
+    learner = BootstrapLearner(VIEWS_ALONE, clusterer, limit=20)
+    again = clone(learner).set_params(choose=0)
+    assert again.get_params()["clusterer__k_max"] == 6
+    assert (again.choose, learner.choose, again.theory) == (0, None, VIEWS_ALONE)
+    assert learner.fit(run) is learner
+    assert not hasattr(clusterer, "k_")  # it was cloned
+    assert learner.confidence_.shape == learner.labels_.shape == (len(run),)
+    assert learner.score(run) == learner.score(images_of(run), learner.labels_) == 1
+    other = simulate(World.named("notched-rectangle"), tours=2, seed=502)
+    assert 0.9 < learner.score(other) <= 1
+    np.testing.assert_array_equal(learner.predict(other), learner.predict(images_of(other)))
+    with pytest.raises(LearnerError, match="y: expected the dstates of the images, got none"):
+        learner.score(images_of(run))
+    with pytest.raises(LearnerError, match="y: expected 96 dstates, one an image"):
+        learner.score(run, [1, 2])
+    broken = replace(other, steps=(other.steps[0], replace(other.steps[1], image=other.steps[3].image), *other.steps[2:]))
+    with pytest.raises(LearnerError, match="expected some steps whose dstate the map tells, got none"):
+        learner.score(broken)
+    with pytest.raises(TraceError, match="traces: expected a Trace, or a list of them, got"):
+        BootstrapLearner().fit("run.jsonl")  # type: ignore[arg-type]
+    assert cross_val_score(BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)), [run, other, other], cv=3).min() > 0.85
+
+
+def test_several_traces_share_views_and_a_map(run: Trace) -> None:
+    short = simulate(World.named("notched-rectangle"), tours=2, seed=503)
+    late = replace(short, steps=short.steps[3:])  # begins at x3
+    learner = BootstrapLearner(VIEWS_ALONE).fit([late, run, short])
+    assert one_to_one(learner.labels_, np.concatenate([true_dstates(t) for t in (late, run, short)]))
+    assert (learner.solution_.steps, len(learner.labels_)) == (len(run), len(run) + len(short) + len(late))
+    broken = replace(short, steps=(short.steps[0], replace(short.steps[1], image=short.steps[3].image), *short.steps[2:]))
+    with pytest.warns(AmbiguousMapWarning, match="trace 1: the map of the longest trace does not tell where any of its 16 steps is"):
+        learner = BootstrapLearner(VIEWS_ALONE).fit([run, broken])
+    assert learner.labels_.tolist()[len(run) - 1 :] == [7] + [-1] * 16
+    narrow = replace(short, steps=tuple(replace(s, image=s.image[:90]) for s in short.steps))
+    with pytest.raises(PerceptionError, match="trace 1: image: expected 180 ranges, as trace 0 has, got 90"):
+        BootstrapLearner().fit([run, narrow])
+
+
+@pytest.mark.parametrize(
+    "clusterer",
+    [GaussianMixture(4, covariance_type="spherical", random_state=0), AgglomerativeClustering(n_clusters=None, distance_threshold=6.0)],
+)
+def test_clusterers_of_others_make_the_views(run: Trace, clusterer: Any) -> None:
+    assert one_to_one(BootstrapLearner(VIEWS_ALONE, clusterer).fit(run).labels_, true_dstates(run))
+
+
+def test_an_image_that_is_noise_is_not_learnt_from(run: Trace) -> None:
+    odd = replace(run, steps=(*run.steps[:-1], replace(run.steps[-1], image=tuple(0.7 * r for r in run.steps[-1].image))))
+    with pytest.warns(ImageWarning, match=r"1 of 96 images are like those of no view.*\(image 95\)"):
+        learner = BootstrapLearner(VIEWS_ALONE, DBSCAN(eps=1.5), limit=10).fit(odd)
+    assert (learner.views_[-1], learner.confidence_[-1], learner.labels_[-1]) == (-1, 0, -1)
+    assert (learner.labels_[:-1] >= 0).all()
+    assert set(learner.recogniser_.classes_) == set(learner.labels_[:-1].tolist())
+
+
+# Which beams tell dstates apart
+
+
+def test_the_beams_that_tell_corners_apart_see_the_notch(run: Trace) -> None:
+    """The notch, or its edge within 15 cm: where the robot faces the notch, it stops at the same distance from it, and sees that the wall beside it is nearer."""
+    truth, images = true_dstates(run), ReciprocalTransformer().fit_transform(images_of(run))
+    poses = np.array([step.truth["pose"] for step in run.steps])
+    for i in range(4):
+        found = telling_features(images, truth, f"x{i}", f"x{i + 4}")
+        assert found.recognised == 1
+        here = truth == f"x{i}"
+        (ranges,), (x, y, heading) = Laser(noise=0).exact(World.named("notched-rectangle"), poses[here][:1]), poses[here][0]
+        for method, shares in found.methods.items():
+            beam = int(shares.argmax())
+            at = x + ranges[beam] * np.cos(heading + BEARINGS[beam]), y + ranges[beam] * np.sin(heading + BEARINGS[beam])
+            assert 2.45 < at[0] < 3.95, (i, method, at)
+            assert at[1] < 0.01, (i, method, at)
+
+
+def test_the_shell_tells_what_tells_dstates_apart(run: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    views, maps = tmp_path / "views.jsonl", tmp_path / "maps.json"
+    learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)).fit(run)
+    run.with_views(learner.views_.tolist()).save(views)
+    maps.write_text(json.dumps(learner.map_.to_dict()))
+    assert main(["tell-apart", str(views), str(maps), "--plot", str(tmp_path / "beams.png")]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert [line.split()[:3] for line in out[1:]] == [[f"{i},", str(i + 4), "1.000"] for i in range(4)]
+    assert (tmp_path / "beams.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["tell-apart", str(views), str(maps), "--dstates", "0,1", "--json"]) == 0
+    (told,) = json.loads(capsys.readouterr().out)
+    assert (told["dstates"], len(told["margin"]), sum(told["linear"])) == ([0, 1], 180, pytest.approx(1))
+    assert main(["tell-apart", str(views), str(maps), "--dstates", "0,99"]) == 1
+    assert "expected at least two images of 99, got 0" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["tell-apart", str(views), str(maps), "--dstates", "0"])
+    assert "expected two dstates with a comma between them" in capsys.readouterr().err
+
+
+# Doubts about the number of views
+
+
+@pytest.fixture(scope="module")
+def large_room() -> Trace:
+    """Eight circuits in a room a tenth longer and wider, where M prefers 2 views, and trimmed M 4."""
+    world = World.named("notched-rectangle")
+    walls = world.segments.copy()
+    walls[walls > 0] *= 1.1
+    trace = simulate(replace(world, segments=walls, start=(3.8, 1.6, 0.0), dstates=()), tours=8, seed=500, stars=False)
+    return replace(trace.without_displacements(), steps=tuple(replace(s, displacement=None) for s in trace.steps))
+
+
+def test_another_map_of_the_runner_up_is_said(large_room: Trace) -> None:
+    with pytest.warns(RunnerUpWarning, match="2 views may be too few: 4 also separate .* another map, of 8 dstates instead of 6; cluster"):
+        learner = BootstrapLearner().fit(large_room)
+    assert (learner.clusterer_.k_, learner.clusterer_.runner_up_, len(learner.map_.dstates)) == (2, 4, 6)
+    with pytest.warns(RunnerUpWarning, match="4 views may be too many: 2 also separate"):
+        trimmed = BootstrapLearner(clusterer=ViewClusterer(by="trimmed", k_max=6, random_state=0)).fit(large_room)
+    assert len(trimmed.map_.dstates) == 8
+
+
+def test_the_shell_says_it_too(large_room: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = (
+        "ssh-abduction: warning: 2 views may be too few: 4 also separate the images well, and give another map, of 8 dstates instead of 6"
+    )
+    run, views = str(tmp_path / "run.jsonl"), str(tmp_path / "views.jsonl")
+    large_room.save(run)
+    assert main(["cluster", run, "-o", views, "--k-max", "6"]) == 0
+    clustered = capsys.readouterr()
+    assert clustered.err.startswith(said)
+    marks = [line.split()[3:] for line in clustered.out.splitlines()[1:4]]
+    assert marks == [["chosen"], [], ["runner-up"]]
+    assert main(["solve", views]) == 0
+    assert capsys.readouterr().err.startswith(said)
+    assert main(["solve", views, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["warnings"][0].startswith(said[len("ssh-abduction: warning: ") :])
+    assert main(["solve", views, "--time-limit", "0.1"]) in {0, 10}  # no time for it
+    assert capsys.readouterr().err == ""
+    assert main(["cluster", views, "-o", views, "--k", "4"]) == 0
+    assert capsys.readouterr().err == ""
+    assert "runner_up" not in Path(views).read_text()
+
+
+def test_a_runner_up_is_whole_or_wrong() -> None:
+    trace = Trace.from_steps("aba", ["travel", "travel"])
+    assert runner_up(trace) is None
+    other = with_runner_up(trace, "abc")
+    assert runner_up(other) == replace(
+        trace.with_views("abc"), steps=tuple(replace(s, view=v) for s, v in zip(other.steps, "abc", strict=True))
+    )
+    assert with_runner_up(other, None) == trace
+    half = replace(trace, steps=(other.steps[0], *trace.steps[1:]))
+    with pytest.raises(TraceError, match="step 1: runner_up: expected a view, as other steps have one"):
+        runner_up(half)
+    wrong = replace(trace, steps=tuple(replace(s, extra={"runner_up": 1.5}) for s in trace.steps))
+    with pytest.raises(TraceError, match=r"runner_up: views\[0\]: expected a text or an integer, got 1.5"):
+        runner_up(wrong)
+    assert second_map(with_runner_up(trace, "xyx"), solve(trace).maps) is None  # other names of the same views
+    found = second_map(with_runner_up(trace, "aaa"), solve(trace, Theory.causal()).maps, Theory.causal())
+    assert found is not None
+    assert found.sentence.startswith(
+        "2 views may be too many: 1 also separate the images well, and give another map, of 1 dstates instead of 2"
+    )
 
 
 # Images
@@ -188,6 +363,8 @@ def test_the_claims_are_those_of_the_paper() -> None:
         assert str(e.views) in papers
         assert f"{e.dstates}, {e.places}, {e.paths}" in papers
         assert "100 %" in papers
+    (higher,) = (c for c in claims("taylor-hall") if c.text.startswith("higher k would still have been free of variability"))
+    assert (higher.paper, higher.ours) == ("above 10", False)
 
 
 def test_recognition_by_poor_labels_is_poor(run: Trace) -> None:
@@ -221,7 +398,7 @@ def test_from_simulation_to_recognition_in_the_shell(tmp_path: Path, capsys: pyt
     assert main(["cluster", path("run.jsonl"), "-o", path("views.jsonl"), "--k-max", "8", "--plot", path("fig.png")]) == 0
     out = capsys.readouterr().out
     assert "4 views of 80 images" in out
-    assert out.splitlines()[0].split() == ["k", "M", "U"]
+    assert out.splitlines()[0].split() == ["k", "M", "trimmed", "U"]
     assert (tmp_path / "fig.png").read_bytes().startswith(b"\x89PNG")
     assert main(["solve", path("views.jsonl"), "--json"]) == 0
     (tmp_path / "maps.json").write_text(capsys.readouterr().out)
@@ -300,6 +477,10 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     page = (tmp_path / "report.html").read_text()
     for name in ("world.png", "learning.png", "map.svg"):
         assert f'src="{name}"' in page
+    assert [f"Figure {number}: " in page for number in (1, 2, 3, 4, 5)] == [False, True, True, True, False]
+    assert "the paper's room has its notch at a corner; here it is a recess in a wall" in html.unescape(page)
+    assert page.count("class='ours'") == sum(claim.ours for claim in claims("notched-rectangle")) == 5
+    assert "ours: errors do not add up" in out
     configuration = json.loads((tmp_path / "configuration.json").read_text())
     assert configuration["seeds"] == [500]
     assert configuration["versions"]["clingo"]

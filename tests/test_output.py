@@ -217,7 +217,9 @@ def test_a_reproduction_writes_its_data_before_it_draws(
 
     monkeypatch.setattr(report, "measure", lambda name, seed: type("Run", (), {"seed": seed}))
     monkeypatch.setattr(report, "to_dict", lambda run: {"seed": run.seed})
-    monkeypatch.setattr(report, "summary", lambda *_: [{"claim": "c", "paper": "p", "here": {"0": "x"}, "holds": 1, "seeds": 1}])
+    monkeypatch.setattr(
+        report, "summary", lambda *_: [{"claim": "c", "ours": False, "paper": "p", "here": {"0": "x"}, "holds": 1, "seeds": 1}]
+    )
     monkeypatch.setattr(report, "_draw", fails)
     assert main(["reproduce", "taylor-hall", "--seeds", "0", "--jobs", "1", "-o", str(tmp_path)]) == 1
     captured = capsys.readouterr()

@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 import tracemalloc
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -21,18 +22,21 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import pdist, squareform
 from sklearn.base import clone
-from sklearn.cluster import DBSCAN, AgglomerativeClustering, KMeans, MeanShift
+from sklearn.cluster import DBSCAN, HDBSCAN, AgglomerativeClustering, KMeans, MeanShift
 from sklearn.metrics import adjusted_rand_score, mutual_info_score
+from sklearn.mixture import BayesianGaussianMixture, GaussianMixture
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from perception import quality, store, views
+from perception.confidence import confidence, nearest_views, warn_of_doubts
 from perception.errors import ImageWarning, PerceptionError
-from perception.quality import cluster_quality, cluster_spread, spanning_tree, uncertainty_coefficient
+from perception.features import strongest, telling_features
+from perception.quality import cluster_quality, cluster_spread, spanning_tree, trimmed_quality, uncertainty_coefficient
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecognizer, learning_curve, recogniser
-from perception.views import ViewClusterer
+from perception.views import ViewClusterer, as_view_clusterer
 from ssh_abduction.errors import SSHError
 
 Images = np.ndarray[Any, Any]
@@ -189,6 +193,42 @@ def test_memory_is_that_of_blocks_not_of_all_pairs() -> None:
     assert peak < 100 * 2**20 < 6_000**2 * 8
 
 
+# M, trimmed
+
+
+def test_trimmed_quality_is_the_ratio_of_quantiles() -> None:
+    images, truth = blobs(4, 10, spread=0.4, seed=3)
+    distances = squareform(pdist(images))
+    for trim in (0.0, 0.1, 0.5):
+        gaps = [np.quantile(distances[truth == a][:, truth == b], trim) for a in range(4) for b in range(a)]
+        widths = [np.quantile(pdist(images[truth == a]), 1 - trim) for a in range(4)]
+        assert trimmed_quality(images, truth, trim) == pytest.approx(min(gaps) / max(widths))
+    assert trimmed_quality(images, truth, 0) == pytest.approx(cluster_quality(images, truth))
+    with pytest.raises(PerceptionError, match=r"trim: expected a share from 0 to 0\.5, got 0\.6"):
+        trimmed_quality(images, truth, 0.6)
+    with pytest.raises(PerceptionError, match="labels: expected a row of 40 labels"):
+        trimmed_quality(images, truth[1:])
+
+
+def test_trimmed_quality_where_it_degenerates(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = np.array([[0.0], [0.0], [1.0], [3.0]])
+    assert math.isnan(trimmed_quality(images, [0, 0, 0, 0]))
+    assert trimmed_quality(images, [0, 1, 2, 3]) == 0
+    assert trimmed_quality(images, [0, 0, 1, 2]) == math.inf
+    many, truth = blobs(3, 100)
+    monkeypatch.setattr(quality, "SAMPLE", 60)
+    assert trimmed_quality(many, truth) == pytest.approx(trimmed_quality(*blobs(3, 20)), rel=0.3)  # of a sample
+    assert trimmed_quality(many, ~np.isin(np.arange(300), quality.sampled(300))) == 0  # a cluster that the sample does not hold
+
+
+def test_one_lost_beam_changes_m_and_not_trimmed_m() -> None:
+    images, truth = blobs(4, 20)
+    spoilt = images.copy()
+    spoilt[0, 0] += 2.5  # almost as far as the next cluster
+    assert cluster_quality(spoilt, truth) < 0.4 * cluster_quality(images, truth)
+    assert trimmed_quality(spoilt, truth) == pytest.approx(trimmed_quality(images, truth), rel=0.05)
+
+
 # U
 
 
@@ -223,6 +263,26 @@ def test_k_is_where_the_quality_peaks() -> None:
     assert (found.predict(images) == found.labels_).all()
     nearest = np.linalg.norm(images[:, None] - found.cluster_centers_, axis=2).argmin(axis=1)
     assert (found.predict(images) == nearest).all()
+
+
+def test_the_runner_up_is_what_trimmed_m_likes_about_as_well() -> None:
+    """Two pairs of clusters, each pair near each other: the farther they are, the less doubt there is that there are four."""
+    rng = np.random.default_rng(0)
+    found = {}
+    for gap in (0.3, 0.5, 1.1, 4.0):
+        images = np.concatenate([rng.normal(c, 0.1, (15, 6)) for c in (0, gap, 8, 8 + gap)])
+        found[gap] = ViewClusterer(k_max=6, random_state=0).fit(images)
+    assert [(f.k_, f.runner_up_) for f in found.values()] == [(2, None), (2, 4), (2, 4), (4, None)]
+    assert found[0.5].trimmed_[2] > 3 * found[0.5].trimmed_[4] > 3 * 2.3  # four are well apart, too, though two are much farther
+    assert found[1.1].runner_up_labels_ is found[1.1].labels_by_k_[4]
+    assert found[1.1].labels_by_k_.keys() == found[1.1].trimmed_.keys() == found[1.1].quality_.keys()
+    spoilt = images.copy()
+    spoilt[0, 0] += 4  # one beam of one image, as far off as the next cluster: M makes a view of that image
+    by = {by: ViewClusterer(k_max=6, by=by, random_state=0).fit(spoilt).k_ for by in ("M", "trimmed")}
+    assert by == {"M": 5, "trimmed": 4}
+    assert (ViewClusterer(k=3).fit(images).runner_up_, ViewClusterer(clusterer=DBSCAN(eps=1.0)).fit(images).runner_up_) == (None, None)
+    with pytest.raises(PerceptionError, match='by: expected "M" or "trimmed", got \'U\''):
+        ViewClusterer(by="U").fit(images)
 
 
 def test_many_images_are_clustered_from_a_sample(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,6 +327,98 @@ def test_noise_is_no_view() -> None:
     assert found.k_ == 3
     assert found.labels_[-1] == -1
     assert found.predict(images[-1:]).tolist() == [-1]
+    assert found.quality_[3] == pytest.approx(plain_quality(images[:-1], found.labels_[:-1]))
+    assert found.confidence_[-1] == 0
+    assert found.confidence_[:-1].min() > 0.9
+    assert math.isnan(found.score(images[-1:]))
+
+
+@pytest.mark.parametrize(
+    ("clusterer", "tried"),
+    [
+        (GaussianMixture(covariance_type="diag", random_state=0), [2, 3, 4, 5, 6]),
+        (AgglomerativeClustering(n_clusters=None, distance_threshold=8.0), [4]),
+        (HDBSCAN(min_cluster_size=5, copy=True), [4]),
+    ],
+)
+def test_mixtures_and_thresholds_plug_in(clusterer: Any, tried: list[int]) -> None:
+    images, truth = blobs(4, 15)
+    found = ViewClusterer(clusterer=clusterer, k_max=6, random_state=0).fit(images)
+    assert (found.k_, list(found.quality_)) == (4, tried)
+    assert adjusted_rand_score(truth, found.labels_) == adjusted_rand_score(truth, found.predict(images + 0.01)) == 1
+    assert found.score(images) == pytest.approx(plain_quality(images, truth))
+    assert found.score(images + 0.3 * np.random.default_rng(0).normal(size=images.shape)) < found.score(images)
+    assert not hasattr(clusterer, "labels_")
+    assert not hasattr(clusterer, "means_")
+
+
+def test_a_given_clusterer_becomes_one_of_views() -> None:
+    images = blobs(4, 15)[0]
+    assert as_view_clusterer(GaussianMixture(3, random_state=0)).fit(images).k_ == 3
+    assert as_view_clusterer(DBSCAN(eps=1.0)).fit(images).k_ == 4
+    same = ViewClusterer(k=2)
+    assert as_view_clusterer(same) is same
+    with pytest.raises(PerceptionError, match="clusterer: expected a scikit-learn clusterer, such as DBSCAN"):
+        as_view_clusterer("k-means")
+    with pytest.raises(PerceptionError, match="k: AgglomerativeClustering finds the number of clusters itself"):
+        ViewClusterer(k=3, clusterer=AgglomerativeClustering(n_clusters=None, distance_threshold=1.0)).fit(images)
+
+
+def test_components_that_stay_empty_are_no_views() -> None:
+    images = np.repeat(np.arange(6.0)[:, None] // 2 * 5, 10, axis=0) + np.random.default_rng(0).normal(0, 0.1, (60, 2))
+    found = ViewClusterer(
+        clusterer=BayesianGaussianMixture(random_state=0, weight_concentration_prior=1e-3, covariance_type="spherical"), k_max=5
+    ).fit(images)
+    assert found.k_ == 3
+    assert all(len(set(labels.tolist())) == k for k, labels in found.labels_by_k_.items())
+
+
+# confidence
+
+
+def test_confidence_is_that_of_the_own_centre_against_the_next() -> None:
+    images, truth = blobs(3, 12)
+    sure = confidence(images, truth)
+    for i in (0, 7, 35):
+        others = [images[(truth == c) & (np.arange(36) != i)].mean(axis=0) for c in range(3)]
+        far = [float(np.linalg.norm(images[i] - centre)) for centre in others]
+        own, next_ = far[truth[i]], min(far[c] for c in range(3) if c != truth[i])
+        assert sure[i] == pytest.approx(next_**2 / (own**2 + next_**2))
+    assert sure.min() > 0.98
+    between = np.vstack([images, (images[truth == 0].mean(axis=0) + images[truth == 1].mean(axis=0)) / 2])
+    assert confidence(between, [*truth, 0])[-1] == pytest.approx(0.5, abs=0.03)
+    assert ViewClusterer(k=3, random_state=0).fit(images).confidence_.tolist() == sure.tolist()
+
+
+def test_confidence_where_nothing_tells() -> None:
+    images, truth = blobs(3, 12)
+    alone = np.vstack([images, np.full((1, 8), 40.0)])
+    assert confidence(alone, [*truth, 3])[-1] == 0.5
+    assert confidence(alone, [*truth, -1])[-1] == 0
+    assert nearest_views(alone, [*truth, -1]).tolist() == [*truth, 2]
+    assert confidence(alone, [0] * 36 + [-1]).tolist() == [1] * 36 + [0]
+    assert confidence(np.ones((4, 2)), [0, 0, 1, 1]).tolist() == [0.5] * 4  # all images are equal
+    with pytest.raises(PerceptionError, match="expected 36 whole numbers, one an image"):
+        confidence(images, truth[1:])
+    with pytest.raises(PerceptionError, match="expected some that are in a cluster, got 36 that are noise"):
+        nearest_views(images, [-1] * 36)
+
+
+def test_doubtful_images_and_views_are_said() -> None:
+    truth, sure = np.arange(60) % 3, np.full(60, 0.99)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_doubts(truth, sure, 3.0)
+    for index, label, certain in ((7, 9, 0.99), (8, 1, 0.6), (9, -1, 0.0)):
+        labels, trust = truth.copy(), sure.copy()
+        labels[index], trust[index] = label, certain
+        with pytest.warns(ImageWarning, match=rf"1 of 60 images are like those of no view.*\(image {index}\)"):
+            warn_of_doubts(labels, trust, 3.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_doubts([0, 1, 2, 2, 0, 3], [0.99, 0.5, 0.99, 0.99, 0.99, 0.5], 3.0)  # nearly all of it was seen once
+    with pytest.warns(ImageWarning, match=r"views overlap \(M is 0\.40, below 1\)"):
+        warn_of_doubts(truth, sure, 0.4)
 
 
 def test_equal_images_are_one_view() -> None:
@@ -379,6 +531,39 @@ def test_a_learning_curve_warns_once() -> None:
 def test_learning_curves_that_cannot_be_drawn(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(PerceptionError, match=message):
         learning_curve(np.ones((6, 2)), [0, 0, 0, 1, 1, 1], **arguments)
+
+
+# what tells two dstates apart
+
+
+def test_the_feature_that_differs_tells_two_apart() -> None:
+    rng = np.random.default_rng(0)
+    labels = np.repeat([3, 8, 5], 20)
+    images = rng.normal(0, [0.1, 0.1, 2.0, 0.1], (60, 4))  # the third is loud, and tells nothing
+    images[labels == 8, 1] += 1
+    found = telling_features(images, labels, 3, 8)
+    for method, shares in found.methods.items():
+        assert (shares.argmax(), shares.sum()) == (1, pytest.approx(1)), method
+        assert (shares >= 0).all()
+    assert telling_features(images[:, [0, 1, 3]], labels, 3, 8).recognised == 1
+    assert telling_features(images, labels, 3, 5).recognised < 0.8
+    assert strongest(found.permutation) == "1"
+    assert (strongest([0.2, 0.2, 0.0, 0.15, 0.2, 0.25], 0.8), strongest([0.0, 0.0])) == ("0–1, 4–5", "–")
+    same = telling_features(np.ones((4, 3)), [0, 0, 1, 1], 0, 1)
+    assert [shares.tolist() for shares in same.methods.values()] == [[0, 0, 0]] * 3
+
+
+@pytest.mark.parametrize(
+    ("labels", "pair", "message"),
+    [
+        ([0, 0, 1, 1], (0, 0), "dstates: expected two different ones, got 0 twice"),
+        ([0, 0, 1, 2], (0, 1), "dstates: expected at least two images of 1, got 1"),
+        ([0, 1], (0, 1), "labels: expected 4, one an image"),
+    ],
+)
+def test_dstates_that_cannot_be_compared(labels: list[int], pair: tuple[int, int], message: str) -> None:
+    with pytest.raises(PerceptionError, match=message):
+        telling_features(np.eye(4), labels, *pair)
 
 
 # files
@@ -502,7 +687,7 @@ def test_docstrings_run() -> None:
     import doctest
     import importlib
 
-    for name in ("quality", "reciprocal", "views", "recognition"):
+    for name in ("confidence", "features", "quality", "reciprocal", "views", "recognition"):
         result = doctest.testmod(importlib.import_module(f"perception.{name}"))
         assert result.failed == 0
         assert result.attempted > 0

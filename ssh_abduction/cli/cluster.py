@@ -10,34 +10,42 @@ from dataclasses import replace
 from pathlib import Path
 
 from ssh_abduction.cli.options import Verbs, add_output, check_picture, picture_file, seed, write
+from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.errors import SSHError
+from ssh_abduction.runner_up import SECONDS, runner_up, second_map, with_runner_up
+from ssh_abduction.solver.search import solve
+from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Cluster the images of a trace into views, as many as separate best (k by M), and write the trace with its views."
+    text = "Cluster the images of a trace into views, as many as separate best (k by M), and write the trace with its views. Where another number "
+    text += "of views is about as good, its views are kept beside them, and it is said whether they give another map."
     parser = verbs.add_parser("cluster", help="cluster images into views", description=text)
     parser.add_argument("trace", help="trace file with images, or - for standard input")
     add_output(parser)
     parser.add_argument("--k", type=int, help="number of views (default: the one with the largest M)")
     parser.add_argument("--k-max", type=int, metavar="K", help="largest number of views to try (default: 20)")
+    by = "choose k by M, which stands on two distances, or by trimmed M, which compares medians of distances (default: M)"
+    parser.add_argument("--by", choices=("M", "trimmed"), default="M", help=by)
     parser.add_argument("--seed", type=seed, default=0, help="seed of k-means (default: 0)")
     parser.add_argument("--plot", type=picture_file, metavar="PNG", help="draw M, and U where the truth is known, against k")
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
+    from perception.confidence import warn_of_doubts
     from perception.images import images_of
     from perception.quality import uncertainty_coefficient
     from perception.reciprocal import ReciprocalTransformer
-    from perception.views import ViewClusterer, labels_by_k
+    from perception.views import ViewClusterer
 
     check_picture(options.plot)
     trace = Trace.load(options.trace)
     images = ReciprocalTransformer().fit_transform(images_of(trace))
     try:
-        clusterer = ViewClusterer(k=options.k, k_max=options.k_max, random_state=options.seed).fit(images)
+        clusterer = ViewClusterer(k=options.k, k_max=options.k_max, random_state=options.seed, by=options.by).fit(images)
     except SSHError as error:
         raise SSHError(f"{options.trace}: {error}") from None
     except ValueError as error:  # scikit-learn's own words for what cannot be clustered
@@ -45,26 +53,40 @@ def run(options: argparse.Namespace) -> int:
     truth = true_dstates(trace)
     uncertainty: dict[int, float] = {}
     if truth is not None:
-        uncertainty = {k: uncertainty_coefficient(labels, truth) for k, labels in labels_by_k(clusterer, images).items()}
+        uncertainty = {k: uncertainty_coefficient(labels, truth) for k, labels in clusterer.labels_by_k_.items()}
     beside = trace.images and os.path.relpath(Path(trace.source or ".").parent / trace.images, Path(options.output).parent)
+    other = clusterer.runner_up_labels_
     clustered = replace(trace.with_views(clusterer.labels_.tolist()), images=beside)
+    clustered = with_runner_up(clustered, None if other is None else other.tolist())
     rows = [
         [
             k,
-            "–" if math.isnan(m) else f"{m:.3f}",
+            *("–" if math.isnan(m) else f"{m:.3f}" for m in (clusterer.quality_[k], clusterer.trimmed_[k])),
             *([f"{uncertainty[k]:.3f}"] if uncertainty else []),
-            "chosen" if k == clusterer.k_ else "",
+            {clusterer.k_: "chosen", clusterer.runner_up_: "runner-up"}.get(k, ""),
         ]
-        for k, m in clusterer.quality_.items()
+        for k in clusterer.quality_
     ]
-    chosen = table(["k", "M", *(["U"] if uncertainty else []), ""], rows)
+    chosen = table(["k", "M", "trimmed", *(["U"] if uncertainty else []), ""], rows)
     write(clustered, options.output, f"{chosen}\n{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}")
+    warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
+    warn(doubts(clustered))
     if options.plot:
         sys.stdout.flush()  # a picture that fails loses nothing of this
         from ssh_abduction.reproduce.figures import draw_quality
 
         draw_quality(options.plot, clusterer.quality_, uncertainty, clusterer.k_)
     return 0
+
+
+def doubts(trace: Trace) -> list[str]:
+    """What is said of the runner-up of a trace that was clustered, if it gives another map: by the default theory, or the causal one where actions have no kind."""
+    theory = Theory.topological() if all(action.kind for action in trace.actions) else Theory.causal()
+    try:
+        found = second_map(trace, solve(trace, theory, limit=SECONDS).maps, theory) if runner_up(trace) else None
+    except SSHError:  # the trace lacks what the theory needs: `solve` will say so
+        return []
+    return [found.sentence] if found else []
 
 
 def true_dstates(trace: Trace) -> list[str] | None:

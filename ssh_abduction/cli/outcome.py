@@ -9,16 +9,20 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from ssh_abduction.asp.control import Grounding
 from ssh_abduction.explain import Explanation, Interrupted, explain
 from ssh_abduction.files import json_line
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.runner_up import second_map
 from ssh_abduction.solver import Search, Solution, Status
 from ssh_abduction.solver.result import summary_of
 from ssh_abduction.solver.sharing import Backbone
 
 SOON = 10_000  # steps of a trace in which noise is sought after Ctrl-C, at most: in 40,000 that takes two seconds
+
+LEAST_LEFT = 0.2  # seconds of a time limit, with less of which the runner-up is not looked at
 
 _heard: list[int] = []  # signals that asked for an end
 EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}
@@ -96,7 +100,24 @@ def warnings_of(search: Search, solution: Solution) -> list[str]:
     if solution.stopped == "interrupted" and len(search.trace) > SOON:
         return []
     noise = [solution.noise.sentence(search.trace)] if solution.noise else []
-    return noise + ([solution.odometry_warning] if solution.odometry_warning else [])
+    return noise + ([solution.odometry_warning] if solution.odometry_warning else []) + _second_opinion(search, solution)
+
+
+_second_opinions: WeakKeyDictionary[Search, list[str]] = (
+    WeakKeyDictionary()
+)  # those sought already, as a search is asked for its warnings twice
+
+
+def _second_opinion(search: Search, solution: Solution) -> list[str]:
+    """What is said of the runner-up's views, where the trace has them, the search came to an end, and there is time left."""
+    if search not in _second_opinions:
+        left = None if search.limit is None else search.limit - solution.seconds.total
+        if solution.stopped not in (None, "maps limit") or (left is not None and left < LEAST_LEFT):
+            return []
+        known = [*solution.maps, *([search.best] if search.best else [])]
+        found = second_map(search.trace, known, search.theory, left, search.memory)
+        _second_opinions[search] = [found.sentence] if found else []
+    return _second_opinions[search]
 
 
 def warn(warnings: Sequence[str]) -> None:

@@ -61,12 +61,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _print(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
-    from ssh_abduction.reproduce.report import spread_of
+    from ssh_abduction.reproduce.report import claimed, spread_of
 
     if options.json:
         print(json.dumps({"experiment": options.experiment, "claims": rows}, ensure_ascii=False, indent=1), flush=True)
         return
-    cells = [[r["claim"], r["paper"], spread_of(r), f"{r['holds']} of {r['seeds']}"] for r in rows]
+    cells = [[claimed(r), r["paper"], spread_of(r), f"{r['holds']} of {r['seeds']}"] for r in rows]
     print(table(["claim", "paper", "here", "holds"], cells), flush=True)
 
 

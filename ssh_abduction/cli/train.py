@@ -10,7 +10,7 @@ from typing import Any
 from ssh_abduction.cli.options import Verbs, check_number, check_picture, output, picture_file, seed
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.errors import MapError, named
-from ssh_abduction.maps import maps_of, read_json
+from ssh_abduction.maps import SSHMap, maps_of, read_json
 from ssh_abduction.trace import Trace
 
 
@@ -26,7 +26,13 @@ def add_parser(verbs: Verbs) -> None:
     curve.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the learning curve")
     curve.add_argument("--json", action="store_true", help="print JSON")
     curve.set_defaults(run=run_learning_curve)
-    for parser in (train, curve):
+    text = "Say by which beams two dstates differ that look alike: by default, each pair of dstates that share a view."
+    apart = verbs.add_parser("tell-apart", help="which beams tell dstates apart that share a view", description=text)
+    apart.add_argument("--dstates", type=pair, metavar="I,J", help="two dstates of the map (default: each pair that shares a view)")
+    apart.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the beams over the scans")
+    apart.add_argument("--json", action="store_true", help="print the share of each beam, by method, as JSON")
+    apart.set_defaults(run=run_tell_apart)
+    for parser in (train, curve, apart):
         parser.add_argument("trace", help="trace file with images")
         parser.add_argument("maps", help="what solve --json printed for this trace, or one saved map")
         parser.add_argument("--map", type=int, metavar="I", help="take the I-th map, from 1 (default: the labels all maps agree on)")
@@ -38,8 +44,22 @@ def add_parser(verbs: Verbs) -> None:
     recognise.set_defaults(run=run_recognise)
 
 
+def pair(text: str) -> tuple[int, int]:
+    """Two numbers with a comma between them."""
+    first, comma, second = text.partition(",")
+    if not (comma and first.strip().isdecimal() and second.strip().isdecimal()):
+        raise argparse.ArgumentTypeError(f"expected two dstates with a comma between them, as 0,4, got {text!r}")
+    return int(first), int(second)
+
+
 def _labelled(options: argparse.Namespace) -> tuple[Any, Any]:
     """The images of a trace and their labels, where these are sure."""
+    images, labels, _ = _mapped(options)
+    return images, labels
+
+
+def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap]:
+    """The same, and the map whose labels they are."""
     from perception.images import images_of
     from ssh_abduction.learner import labels_of
 
@@ -51,13 +71,14 @@ def _labelled(options: argparse.Namespace) -> tuple[Any, Any]:
         maps,
         None if options.map is None else options.map - 1,
         bool(data.get("complete", True)) if isinstance(data, dict) else True,
+        data.get("status", "optimal") == "optimal" if isinstance(data, dict) else True,
     )
     if len(labels) != len(trace):
         raise MapError(
             f"{options.maps}: expected labels for the {len(trace)} steps of {options.trace}, got {len(labels)}; solve this trace"
         )
     sure = labels >= 0
-    return images_of(trace)[sure], labels[sure]
+    return images_of(trace)[sure], labels[sure], maps[(options.map or 1) - 1]
 
 
 def run_train(options: argparse.Namespace) -> int:
@@ -111,4 +132,32 @@ def run_recognise(options: argparse.Namespace) -> int:
         print(json.dumps(labels))
     else:
         print(table(["step", "dstate"], [(step, "nowhere" if label is None else label) for step, label in enumerate(labels)]))
+    return 0
+
+
+def run_tell_apart(options: argparse.Namespace) -> int:
+    from perception.features import strongest, telling_features
+    from perception.reciprocal import ReciprocalTransformer
+
+    check_picture(options.plot)
+    ranges, labels, ssh_map = _mapped(options)
+    images = ReciprocalTransformer().fit_transform(ranges)
+    views = {s.id: s.view for s in ssh_map.dstates}
+    alike = [(a, b) for a in views for b in views if a < b and views[a] == views[b]]
+    seen = {label for label in set(labels.tolist()) if (labels == label).sum() > 1}
+    pairs = [options.dstates] if options.dstates else [p for p in alike if seen.issuperset(p)]
+    if not pairs:
+        raise MapError(f"{options.maps}: expected dstates that share a view, with two images each, got none; name two with --dstates I,J")
+    found = {p: telling_features(images, labels, *p) for p in pairs}
+    if options.json:
+        told = [{"dstates": p, "recognised": f.recognised, **{k: v.tolist() for k, v in f.methods.items()}} for p, f in found.items()]
+        print(json.dumps(told))
+    else:
+        rows = [[f"{a}, {b}", f"{f.recognised:.3f}", *(strongest(shares) for shares in f.methods.values())] for (a, b), f in found.items()]
+        print(table(["dstates", "told apart", *(f"beams by {method}" for method in next(iter(found.values())).methods)], rows))
+    if options.plot:
+        sys.stdout.flush()  # a picture that fails loses nothing of this
+        from ssh_abduction.reproduce.figures import draw_telling
+
+        draw_telling(options.plot, ranges, labels, found)
     return 0

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.features import TellingFeatures
 from perception.recognition import LearningCurve
 from simulator.laser import BEARINGS
 from simulator.world import World
@@ -160,6 +161,33 @@ def draw_views(path: str | Path, images: NDArray[np.float64], views: NDArray[Any
         dstates = sorted(set(truth[views == name].tolist()))
         shown = ", ".join(dstates) if len(dstates) < 3 else f"{dstates[0]}, … ({len(dstates)})"
         axes.set_title(f"view {name}: {shown}", fontsize=7)
+    _save(figure, path)
+
+
+def draw_telling(
+    path: str | Path, ranges: NDArray[np.float64], labels: NDArray[Any], found: Mapping[tuple[int, int], TellingFeatures]
+) -> None:
+    """Which beams tell pairs of dstates apart: a row for each pair, a column for each method, over the median scan of each of the two.
+
+    ranges  (n, d) metres, over the half circle ahead, the first at the right
+    labels  (n,) the dstate of each
+    """
+    methods = list(next(iter(found.values())).methods)
+    figure, grid = _pyplot().subplots(len(found), len(methods), figsize=(3.2 * len(methods), 2.3 * len(found)), squeeze=False)
+    bearings = np.radians((np.arange(ranges.shape[1]) + 0.5) * 180 / ranges.shape[1] - 90)
+    for row, ((a, b), telling) in zip(grid, found.items(), strict=True):
+        scans = [np.median(ranges[labels == name], axis=0) for name in (a, b)]
+        far = 1.05 * min(8.0, max(float(np.max(scan)) for scan in scans))
+        for axes, (method, shares) in zip(row, telling.methods.items(), strict=True):
+            for scan, colour, dashes in zip(scans, (BLUE, GREEN), ("-", "--"), strict=True):
+                axes.plot(-scan * np.sin(bearings), scan * np.cos(bearings), dashes, color=colour, linewidth=0.8)
+            at = np.flatnonzero(shares > 0)
+            x, y = -scans[0][at] * np.sin(bearings[at]), scans[0][at] * np.cos(bearings[at])
+            axes.scatter(x, y, s=300 * shares[at] / max(shares.max(), 0.01) * 0.5, color=ORANGE, alpha=0.6, linewidths=0)
+            axes.plot(0, 0, "^", color="black", markersize=5)
+            axes.set(aspect="equal", xlim=(-far, far), ylim=(-0.08 * far, far))
+            axes.set_title(f"{a} or {b}: {method}", fontsize=8)
+            axes.axis("off")
     _save(figure, path)
 
 

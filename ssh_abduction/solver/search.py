@@ -172,6 +172,7 @@ class Search:
         self._asked_speedups = checked_speedups(speedups)
         self._on_progress = on_progress
         self._watch = Watch(limit, memory, self._report)
+        self.limit, self.memory = limit, memory
         self._task = Task.of(trace, self.theory, self._watch, speedups)
         self._known = Known(self.theory)
         self._judging = Judging(trace, self.theory)

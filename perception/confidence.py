@@ -1,0 +1,107 @@
+"""How sure a view is: whether an image is near the others of its cluster, and far from the next one.
+
+>>> confidence([[0.0], [0.2], [4.0], [4.2], [1.9]], [0, 0, 1, 1, 0]).round(2).tolist()
+[0.94, 0.96, 1.0, 1.0, 0.6]
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist
+from sklearn.utils import check_array
+
+from perception.errors import ImageWarning, PerceptionError, equal_length
+
+NOISE = -1  # the label that clusterers give to an image that is in no cluster
+# An image with less confidence than this is said to be doubtful. Good images of the paper's worlds have 0.93 and more, those with somebody before the laser 0.5.
+SURE = 0.8
+# A view of FEW images or less, or of at most RARE times as many as the view of the middle image has, is said to be doubtful where that one has SEEN or more: while a
+# robot explores, views that were seen once are nothing strange.
+FEW, RARE, SEEN = 2, 0.1, 6
+# So many images are named at most.
+NAMED = 8
+
+
+def confidence(X: ArrayLike, labels: ArrayLike) -> NDArray[np.float64]:
+    """How sure the view of each image is, (n,), in [0, 1].
+
+    With `own` the distance of an image to the centre of the other images of its view, and `next` its distance to the nearest centre of another view, it is
+    next² / (own² + next²): 1 at the own centre, 0.5 half way. This is the membership of fuzzy c-means with two centres (Bezdek 1981). An image that is alone in
+    its view has 0.5, as nothing speaks for the view or against it. Noise (label -1) has 0: it has no view. Where there is one view, all of its images have 1.
+
+    X       (n, d) images, finite
+    labels  (n,), views, or -1 for noise
+    Raises PerceptionError for labels of another length.
+    """
+    images, of = _checked(X, labels)
+    views, number, counts = np.unique(of[of != NOISE], return_inverse=True, return_counts=True)
+    sure = np.zeros(len(images))
+    if len(views) < 2:
+        sure[of != NOISE] = 1.0
+        return sure
+    inside = images[of != NOISE]
+    distances = cdist(inside, _centres(inside, number, len(views)))
+    here, size = np.arange(len(inside)), counts[number]
+    own = distances[here, number] * size / np.maximum(size - 1, 1)  # the centre without the image itself
+    distances[here, number] = np.inf
+    next_ = distances.min(axis=1)
+    own[size == 1] = next_[size == 1]
+    total = own**2 + next_**2
+    sure[of != NOISE] = np.divide(next_**2, total, out=np.full(len(inside), 0.5), where=total > 0)
+    return sure
+
+
+def nearest_views(X: ArrayLike, labels: ArrayLike) -> NDArray[np.intp]:
+    """The labels, (n,), but for noise (-1) the view of the nearest centre. Raises PerceptionError where all is noise."""
+    images, of = _checked(X, labels)
+    noise = of == NOISE
+    if noise.all():
+        raise PerceptionError(
+            f"images: expected some that are in a cluster, got {len(of)} that are noise; let clusters be smaller, or wider"
+        )
+    if not noise.any():
+        return of
+    views, number = np.unique(of[~noise], return_inverse=True)
+    found = of.copy()
+    found[noise] = views[cdist(images[noise], _centres(images[~noise], number, len(views))).argmin(axis=1)]
+    return found
+
+
+def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
+    """An ImageWarning where images are noise, have little confidence, or are nearly alone in their view, and one where M says that views overlap.
+
+    labels, sure  (n,): views, or -1 for noise, and the confidence of each
+    quality       M
+    """
+    of, certain = np.asarray(labels), np.asarray(sure)
+    number, counts = np.unique(of, return_inverse=True, return_counts=True)[1:]
+    size = counts[number]
+    usual = float(np.median(size[of != NOISE])) if (of != NOISE).any() else 0.0
+    rare = size <= (max(RARE * usual, FEW) if usual >= SEEN else 0)
+    doubtful = np.flatnonzero((of == NOISE) | rare | ((certain < SURE) & (size > 1)))
+    if len(doubtful):
+        named = ", ".join(map(str, doubtful[:NAMED].tolist())) + (", …" if len(doubtful) > NAMED else "")
+        text = f"{len(doubtful)} of {len(of)} images are like those of no view, or of a view that was hardly ever seen (image {named})"
+        warnings.warn(
+            f"{text}: their views may be wrong, and the map with them; look whether something stood before the laser", ImageWarning, 2
+        )
+    if quality < 1:
+        text = f"views overlap (M is {quality:.2f}, below 1): some images of two views are nearer to each other than some of one view"
+        warnings.warn(f"{text}; log images where the robot stands still, at places that it comes back to", ImageWarning, 2)
+
+
+def _centres(images: NDArray[np.float64], number: NDArray[np.intp], views: int) -> NDArray[np.float64]:
+    """The mean image of each view, (k, d)."""
+    return np.array([images[number == view].mean(axis=0) for view in range(views)])
+
+
+def _checked(X: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    images: Any = check_array(equal_length(X), dtype=np.float64)
+    of = np.asarray(labels)
+    if of.shape != (len(images),) or not np.issubdtype(of.dtype, np.integer):
+        raise PerceptionError(f"labels: expected {len(images)} whole numbers, one an image, got an array of shape {of.shape}")
+    return images, of.astype(np.intp)

@@ -1,0 +1,130 @@
+"""Which beams tell two dstates apart that look alike: what a recogniser goes by, once the map has told it that they are two.
+
+>>> images = [[1.0, 2.0, 3.0], [1.1, 2.0, 3.0], [1.0, 2.0, 5.0], [1.1, 2.0, 5.1], [1.0, 2.1, 3.0], [1.0, 2.1, 5.0]]
+>>> found = telling_features(images, [4, 4, 7, 7, 4, 7], 4, 7)
+>>> {method: int(shares.argmax()) for method, shares in found.methods.items()}, found.recognised
+({'margin': 2, 'permutation': 2, 'linear': 2}, 1.0)
+
+The paper hopes that back-propagation could learn which features of an image matter. Its recogniser is the nearest neighbour, which has no weights; so three answers stand beside each other, each with its own blind spot:
+
+- margin: by how much a feature makes the nearest image of the other dstate farther than the nearest one of the own (Relief: Kira and Rendell 1992);
+- permutation: how much of that margin is lost once the feature is shuffled among the images (scikit-learn's permutation_importance);
+- linear: what a feature adds to the difference between the two dstates in a logistic regression.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist
+from sklearn.inspection import permutation_importance
+from sklearn.linear_model import LogisticRegression
+from sklearn.neighbors import KNeighborsClassifier
+from sklearn.utils import check_array
+
+from perception.errors import PerceptionError, equal_length
+
+Floats = NDArray[np.float64]
+# How often each feature is shuffled.
+SHUFFLED = 10
+
+
+@dataclass(frozen=True, eq=False)
+class TellingFeatures:
+    """How much each feature does to tell two dstates apart: for each method shares, (d,), that are not negative and sum to 1, or are all 0 where nothing tells.
+
+    margin, permutation, linear  the shares, by method
+    recognised                   the share of images whose nearest other image is of their own dstate; about 0.5 where the two cannot be told apart, and then
+                                 the shares mean nothing
+    """
+
+    margin: Floats
+    permutation: Floats
+    linear: Floats
+    recognised: float
+
+    @property
+    def methods(self) -> dict[str, Floats]:
+        return {"margin": self.margin, "permutation": self.permutation, "linear": self.linear}
+
+
+def telling_features(X: ArrayLike, labels: ArrayLike, a: Any, b: Any, random_state: int = 0) -> TellingFeatures:
+    """Which features tell the dstates `a` and `b` apart.
+
+    X       (n, d) images, as the recogniser compares them: reciprocals of ranges
+    labels  (n,) the dstate of each image; images of other dstates are left out
+
+    Raises PerceptionError where one of the two has fewer than two images, or a is b.
+    """
+    images = check_array(equal_length(X), dtype=np.float64)
+    of = np.asarray(labels)
+    if of.shape != (len(images),):
+        raise PerceptionError(f"labels: expected {len(images)}, one an image, got an array of shape {of.shape}")
+    if a == b:
+        raise PerceptionError(f"dstates: expected two different ones, got {a!r} twice; name another one")
+    for name in (a, b):
+        if np.count_nonzero(of == name) < 2:
+            seen = np.count_nonzero(of == name)
+            raise PerceptionError(f"dstates: expected at least two images of {name!r}, got {seen}; log more, or name another one")
+    images, second = images[(of == a) | (of == b)], of[(of == a) | (of == b)] == b
+    hit, miss = _neighbours(images, second)
+    margin = (np.abs(images - images[miss]) - np.abs(images - images[hit])).mean(axis=0)
+    far = np.linalg.norm(images - images[miss], axis=1) - np.linalg.norm(images - images[hit], axis=1)
+    return TellingFeatures(
+        _shares(margin), _shares(_permuted(images, second, random_state)), _shares(_linear(images, second)), float(np.mean(far > 0))
+    )
+
+
+def strongest(shares: ArrayLike, most: float = 0.5) -> str:
+    """The features that have the largest shares, and together `most` of all, as stretches: "3–14, 80"."""
+    weights = np.asarray(shares)
+    order = np.argsort(-weights, kind="stable")
+    chosen = np.sort(order[: int(np.searchsorted(np.cumsum(weights[order]), most * weights.sum())) + 1])
+    if not weights.any():
+        return "–"
+    parts = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
+    return ", ".join(str(part[0]) if len(part) == 1 else f"{part[0]}–{part[-1]}" for part in parts)
+
+
+def _neighbours(images: Floats, second: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """For each image the nearest other one of its dstate, and the nearest one of the other dstate."""
+    distances = cdist(images, images)
+    np.fill_diagonal(distances, np.inf)
+    same = second[:, None] == second
+    hits, misses = np.where(same, distances, np.inf).argmin(axis=1), np.where(same, np.inf, distances).argmin(axis=1)
+    return hits.astype(np.intp), misses.astype(np.intp)
+
+
+def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
+    """The margin lost by shuffling each feature. Every second image of each dstate is known, and the others are asked for."""
+    order = np.argsort(second, kind="stable")
+    known, asked = order[::2], order[1::2]
+    model = KNeighborsClassifier(1, algorithm="brute").fit(images[known], second[known])
+    return np.asarray(
+        permutation_importance(model, images[asked], second[asked], scoring=_margin, n_repeats=SHUFFLED, random_state=seed).importances_mean
+    )
+
+
+def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
+    """By how much the nearest image known of the other dstate is farther than that of the own, squared, on the average.
+
+    Squares, as to them a shuffled feature that tells nothing adds the same on both sides.
+    """
+    distances = cdist(images, model._fit_X, "sqeuclidean")
+    same = second[:, None] == model.classes_[model._y]
+    return float((np.where(same, np.inf, distances).min(axis=1) - np.where(same, distances, np.inf).min(axis=1)).mean())
+
+
+def _linear(images: Floats, second: NDArray[np.bool_]) -> Floats:
+    """What each feature adds to the score of the one dstate against the other."""
+    model = LogisticRegression(max_iter=1000).fit(images - images.mean(axis=0), second)
+    return np.asarray(model.coef_[0] * (images[second].mean(axis=0) - images[~second].mean(axis=0)))
+
+
+def _shares(weights: Floats) -> Floats:
+    positive = np.maximum(weights, 0)
+    total = positive.sum()
+    return positive / total if total > 0 else positive

@@ -1,0 +1,126 @@
+"""The labels that maps give to the steps of a trace, for a recogniser to learn from."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.confidence import NOISE
+from perception.recognition import recogniser
+from ssh_abduction.errors import SSHError
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver.result import Solution, Status
+from ssh_abduction.trace import Trace
+from ssh_abduction.traces import Traces
+
+
+class LearnerError(SSHError):
+    """The loop cannot be closed: there is no map, or the maps agree on no label."""
+
+
+class AmbiguousMapWarning(UserWarning):
+    """Several minimal maps remain, and only the labels that they agree on are learnt from; or the map is not proven minimal."""
+
+
+def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool = True, proven: bool = True) -> NDArray[np.intp]:
+    """The label of each step, (n,): its dstate in the chosen map; or, if none is chosen, in the first map, and -1 where the maps disagree.
+
+    Maps agree on a step if the first step at its dstate is the same in all of them. Warns if no map is chosen and they do not agree
+    everywhere, if there may be more (`complete` is false), or if they are not `proven` minimal. Raises LearnerError where no map or no label is left.
+    """
+    if not maps:
+        raise LearnerError("maps: expected at least one to take labels from, got none; see the solution's status")
+    if choose is not None and not 0 <= choose < len(maps):
+        raise LearnerError(f"map: expected an index from 0 to {len(maps) - 1}, got {choose}")
+    labels = np.array(maps[choose or 0].labels, np.intp)
+    if choose is not None:
+        return labels
+    for i, ssh_map in enumerate(maps):
+        if len(ssh_map.labels) != len(labels):
+            raise LearnerError(
+                f"maps: expected maps of one trace, {len(labels)} labels each, got {len(ssh_map.labels)} in map {i + 1}; solve one trace"
+            )
+    first = [_first_steps(ssh_map) for ssh_map in maps]
+    agreed = np.all([f == first[0] for f in first], axis=0)
+    if not proven:
+        unsure = f"the map of {len(maps[0].dstates)} dstates is the best that was found, and not proven minimal"
+        warnings.warn(f"{unsure}: its labels may be wrong; give more time, or look for bad views", AmbiguousMapWarning, stacklevel=2)
+    elif not agreed.all() or not complete:
+        told = f"{'' if complete else 'at least '}{len(maps)} minimal map{'' if len(maps) == 1 else 's'}"
+        unsure = f"{told} remain{'s' if len(maps) == 1 else ''}, and agree on {agreed.sum()} of {len(agreed)} labels"
+        warnings.warn(f"{unsure}: only these are learnt from; choose a map, or explore more", AmbiguousMapWarning, stacklevel=2)
+    if not agreed.any():
+        raise LearnerError("labels: expected some that all maps agree on, got none; choose a map")
+    return np.where(agreed, labels, -1)
+
+
+def map_of(solution: Solution, choose: int | None = None) -> tuple[SSHMap, NDArray[np.intp]]:
+    """The map that is learnt from, and its labels, (n,), as `labels_of` gives them."""
+    labels = labels_of(solution.maps, choose, solution.complete, solution.status is Status.OPTIMAL)
+    return solution.maps[choose or 0], labels
+
+
+def labels_of_all(ssh_map: SSHMap, labels: NDArray[np.intp], traces: Traces, views: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The label of each step of several traces, (n,): of the longest trace its labels, as the map was made for it, and of the others what the map tells.
+
+    A step without a view, which is -1 among `views` (n,), has no label (-1). Warns where another trace contradicts the map, or cannot be placed on it.
+    """
+    if len(traces.each) == 1:
+        return np.where(views == NOISE, -1, labels)
+    own = traces.parts(traces.images)[traces.longest]
+    looks = recogniser().fit(own[labels >= 0], labels[labels >= 0]).predict(traces.images)
+    found = labels_on(ssh_map, traces, views, looks)
+    for i, part in enumerate(traces.parts(found)):
+        if i == traces.longest:
+            part[:] = labels
+        elif (part < 0).all():
+            text = f"trace {i}: the map of the longest trace does not tell where any of its {len(part)} steps is"
+            warnings.warn(
+                f"{text}: it is not learnt from; drive it longer, or where the longest one was", AmbiguousMapWarning, stacklevel=3
+            )
+    return np.where(views == NOISE, -1, found)
+
+
+def labels_on(ssh_map: SSHMap, traces: Traces, views: NDArray[np.intp], looks: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The dstate of each step of all traces, (n,), where the map tells it, else -1.
+
+    views  (n,) of the steps, -1 where there is none
+    looks  (n,) dstates that the images look like: dstates that are not among these are not told
+    """
+    parts = zip(traces.each, traces.parts(views), traces.parts(looks), strict=True)
+    found = np.concatenate([_followed(ssh_map, trace, seen.tolist(), like) for trace, seen, like in parts])
+    return np.where(np.isin(found, looks), found, -1)
+
+
+def _followed(ssh_map: SSHMap, trace: Trace, views: Sequence[int], looks: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The dstate of each step of a trace that may begin anywhere on a map: of all beginnings that no view contradicts, the one that fits most images.
+
+    Where an action was never tried in a dstate, a way is lost: from there on it tells nothing (-1), and contradicts nothing. Where two ways fit equally many
+    images, or none fits half of the images that it tells of, nothing is told.
+    """
+    leads = {(here, action): there for here, action, there in ssh_map.links}
+    ways = []
+    for start in range(len(ssh_map.dstates)):
+        way: list[int] = []
+        at: int | None = start
+        for step, view in enumerate(views):
+            if at is not None and view not in (NOISE, ssh_map.dstates[at].view):
+                break
+            way.append(-1 if at is None else at)
+            if step < len(trace.actions):
+                at = None if at is None else leads.get((at, trace.actions[step].name))
+        else:
+            ways.append(np.array(way, np.intp))
+    ways.sort(key=lambda way: -np.count_nonzero(way == looks))
+    fits = [np.count_nonzero(way == looks) for way in ways[:2]]
+    sure = fits and fits[0] >= np.count_nonzero(ways[0] >= 0) / 2 and fits[0] > max(fits[1:], default=0)
+    return ways[0] if sure else np.full(len(views), -1, np.intp)
+
+
+def _first_steps(ssh_map: SSHMap) -> NDArray[np.intp]:
+    """For each step, (n,), the first step at its dstate."""
+    _, first, dstates = np.unique(ssh_map.labels, return_index=True, return_inverse=True)
+    return np.asarray(first[dstates], np.intp)

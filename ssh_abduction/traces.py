@@ -1,0 +1,71 @@
+"""Several traces of one world, as one table of images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.confidence import nearest_views
+from perception.errors import PerceptionError
+from perception.images import images_of
+from ssh_abduction.errors import TraceError, brief
+from ssh_abduction.runner_up import with_runner_up
+from ssh_abduction.trace import Trace
+
+Integers = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Traces:
+    """Traces of one world, whose steps are counted one after the other: n in all."""
+
+    each: tuple[Trace, ...]
+
+    @classmethod
+    def of(cls, given: Any) -> Traces:
+        """One trace, or several. Raises TraceError."""
+        if isinstance(given, Traces):
+            return given
+        each = (given,) if isinstance(given, Trace) else tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else ()
+        if not each or not all(isinstance(trace, Trace) for trace in each):
+            raise TraceError(
+                f"traces: expected a Trace, or a list of them, got {brief(given)}; make one with Trace.load or Trace.from_steps"
+            )
+        return cls(each)
+
+    @classmethod
+    def are(cls, given: Any) -> bool:
+        """Whether something is a trace, or traces."""
+        return isinstance(given, Traces | Trace) or (isinstance(given, Sequence) and len(given) > 0 and isinstance(given[0], Trace))
+
+    @cached_property
+    def images(self) -> NDArray[np.float64]:
+        """The images of all steps, (n, d). Raises PerceptionError, also where two traces have images of different lengths."""
+        tables = [images_of(trace) for trace in self.each]
+        for i, table in enumerate(tables):
+            if table.shape[1] != tables[0].shape[1]:
+                mend = "take traces of one laser"
+                raise PerceptionError(
+                    f"trace {i}: image: expected {tables[0].shape[1]} ranges, as trace 0 has, got {table.shape[1]}; {mend}"
+                )
+        return np.concatenate(tables)
+
+    @property
+    def longest(self) -> int:
+        """The number of the longest trace, the first of several."""
+        return max(range(len(self.each)), key=lambda i: (len(self.each[i]), -i))
+
+    def parts(self, of_all: NDArray[Any]) -> list[NDArray[Any]]:
+        """What is told of all steps, (n, …), trace by trace."""
+        return np.split(of_all, np.cumsum([len(trace) for trace in self.each])[:-1])
+
+    def with_views(self, images: NDArray[np.float64], views: Integers, second: Integers | None) -> Traces:
+        """These traces with views, (n,), and, where there is a runner-up, with its views. Noise has the view of the nearest centre among the images, (n, d)."""
+        seen = [t.with_views(v.tolist()) for t, v in zip(self.each, self.parts(nearest_views(images, views)), strict=True)]
+        others = [None] * len(seen) if second is None else [part.tolist() for part in self.parts(second)]
+        return Traces(tuple(with_runner_up(t, other) for t, other in zip(seen, others, strict=True)))
