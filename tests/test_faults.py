@@ -198,9 +198,14 @@ def test_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkey
     said = capsys.readouterr().out
     assert "4 dstates, and the view at step 9 is misread: v0, expected v1" in said
     assert main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    text = capsys.readouterr().out
+    Path("maps.json").write_text(text)
+    answer = json.loads(text)
     assert answer["maps"][0]["faults"] == [{"step": 9, "kind": "misread", "seen": "v0", "expected": "v1"}]
     assert answer["cost"]["faults"] == 1.5
+    assert main(["check", "trace.jsonl", "maps.json"]) == 0
+    assert main(["check", "--bound", "trace.jsonl", "maps.json"]) == 1
+    assert "bound: expected a theory without faults" in capsys.readouterr().err
 
 
 def test_the_front_is_what_brute_force_finds() -> None:

@@ -58,6 +58,10 @@ def run(options: argparse.Namespace) -> int:
         print(f"not checked, as they are a user's own: {printable(', '.join(not_checked))}")
     if not options.bound:
         return EXIT_VIOLATED if broken else 0
+    if resolved.has_faults or (solved is not None and solved.has_faults):
+        raise MapError(
+            "bound: expected a theory without faults (misread, slipped), as where steps may be disbelieved no clique of them proves anything"
+        )
     doubt = None
     if broken:
         doubt = "some maps break axioms"
