@@ -211,7 +211,7 @@ def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, 
     assert found.count == len(set(found.maps))
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=15, deadline=None, derandomize=True)
 @given(framed_traces(), framed_theories(), st.data())
 def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, data: st.DataObject) -> None:
     """Whether clingo is told what is new, or all of it anew."""
@@ -247,7 +247,7 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
         mapper = OnlineMapper(first.view or "", star=first.star, limit=None, maps=0)
         for i, (action, step) in enumerate(zip(trace.actions, rest, strict=True)):
             answer = mapper.observe(action, step.view or "", star=step.star)
-            if i % 3 == seed % 3:
+            if i % 5 == seed or i == len(rest) - 1:
                 expected = solve(trace.prefix(i + 2), maps=0, speedups=Speedups.without("sides"))
                 assert (answer.cost, answer.bound.dstates, answer.complete) == (expected.cost, expected.bound.dstates, True)
                 assert set(answer.maps) == set(expected.maps)
@@ -258,17 +258,17 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
     assert seed != 0 or any(told for _, told in paths)
 
 
-@pytest.mark.parametrize("off", ["", "clique", "core_guided", "sides"])
 @pytest.mark.parametrize("seed", range(3))
-def test_each_speedup_off_alone(seed: int, off: str) -> None:
+def test_each_speedup_off_alone(seed: int) -> None:
     """On walks long enough for cores, for visits that have to be told to be transitive, and for maps that are found nearby."""
     trace = maze(2, 2, steps=45, seed=seed, stars=True).trace
     expected = solve(trace, Theory.topological(), maps=0, speedups=Speedups.without("names"))
-    with patch.multiple(same, MANY=1, AT_A_TIME=5):
-        found = solve(trace, Theory.topological(), maps=0, speedups=Speedups.without(off))
-    assert set(found.maps) == set(expected.maps)
-    assert found.cost == expected.cost
-    assert found.bound.dstates == expected.bound.dstates
+    for off in ("", "clique", "core_guided", "sides"):
+        with patch.multiple(same, MANY=1, AT_A_TIME=5):
+            found = solve(trace, Theory.topological(), maps=0, speedups=Speedups.without(off))
+        assert set(found.maps) == set(expected.maps), off
+        assert found.cost == expected.cost, off
+        assert found.bound.dstates == expected.bound.dstates, off
 
 
 def test_apart_nodes_are_different_dstates_of_the_world() -> None:
@@ -391,7 +391,7 @@ def test_what_is_not_told_beforehand_is_found() -> None:
 def test_sides_and_streets_say_the_same(theory: Theory) -> None:
     """sides_framed.lp, of one path and visits that are one, against paths_framed.lp, of all paths and settled dstates that may have none."""
     contradicted = 0
-    for seed in range(12):
+    for seed in range(6):
         trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
         engine = Search(trace, theory)._prefixes.engine
         assert isinstance(engine, FramedEngine)
@@ -427,7 +427,7 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
             allowed = next(engine.asker.answers(lambda _: True, "ignore", 1, control=control), False)
             assert not (allowed and dstate in contrary)
             assert allowed or {y for x, y, _ in segments if x == dstate} & set(contrary)
-    assert contradicted > 10
+    assert contradicted > 3
 
 
 def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
@@ -447,7 +447,7 @@ def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
     assert check(walk.trace, solution.maps[0], Theory.topological()) == ()
 
 
-@pytest.mark.parametrize(("seed", "fewest", "paths"), [(0, 57, 7), (1, 58, 5), (2, 53, 7)])
+@pytest.mark.parametrize(("seed", "fewest", "paths"), [(1, 58, 5), (2, 53, 7)])
 def test_a_maze_half_explored_is_mapped(seed: int, fewest: int, paths: int) -> None:
     """Few views tell little: order and sides have to. In the last one some dstates have no paths though no single path shows it."""
     trace = maze(10, 10, steps=4000, seed=seed, stars=True).trace.prefix(150)
@@ -464,7 +464,7 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
     trace = maze(10, 10, steps=150, seed=0, stars=True).trace
     fewest: set[int] = set()
     stopped = 0
-    for stop in range(0, 50, 2):
+    for stop in range(0, 50, 4):
         engine = Search(trace, Theory.topological())._prefixes.engine
         assert isinstance(engine, FramedEngine)
         engine.grow(len(trace))
@@ -484,7 +484,7 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
         assert len(set(labels)) == engine.bound
         fewest.add(len(set(labels)))
     assert len(fewest) == 1
-    assert stopped > 10
+    assert stopped > 5
 
 
 def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
@@ -544,7 +544,7 @@ def places(walk: Walk, chart: FramedChart) -> list[object]:
     return list(place.values())
 
 
-@settings(max_examples=180, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3)), min_size=2, max_size=7), st.data())
 def test_what_fails_to_be_transitive_is_among_the_scattered(states: list[tuple[int, int]], data: st.DataObject) -> None:
     """Visits at places, but for some pairs that are left out, turned otherwise, or added."""
@@ -609,7 +609,7 @@ def node_labels(ssh_map: SSHMap, chart: FramedChart) -> list[int]:
     return [ssh_map.labels[chart.node_of.index(node)] for node in range(len(chart.seen))]
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(framed_traces(), framed_theories(), st.data())
 def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: Theory, data: st.DataObject) -> None:
     """So merging by evidence may keep to it."""
@@ -627,7 +627,7 @@ def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: T
         assert all(labels[a] == labels[b] for a, b in one)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(framed_traces(), framed_theories(), st.lists(st.integers(-1, 4), min_size=9, max_size=9), st.booleans())
 def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[int], told: bool) -> None:
     """Of the causal axioms; and where separate paths fit it, others do."""
@@ -661,7 +661,7 @@ def test_a_true_guess_stays_as_it_is(seed: int) -> None:
     assert asked._paths.labels_near(chart, apart, some) == truth
 
 
-@pytest.mark.parametrize(("size", "steps", "seed"), [(5, 300, 0), (6, 300, 2), (8, 600, 1)])
+@pytest.mark.parametrize(("size", "steps", "seed"), [(5, 300, 0), (6, 300, 2), (7, 400, 1)])
 def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, seed: int) -> None:
     """Where the causal axioms do not show that they are two, but paths do."""
     walk = maze(size, size, steps=steps, seed=seed, stars=True)
@@ -679,7 +679,7 @@ def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, s
     wrong = [guess for guess in wrong if len(set(kept(apart, chart.links, guess))) < len(set(truth))]
     without_streets = [guess for guess in wrong if not known.may_fit(chart, kept(apart, chart.links, guess), [])]
     assert without_streets
-    for guess in without_streets[:4]:
+    for guess in without_streets[:2]:
         labels = known.labels_near(chart, apart, guess)
         assert labels
         assert chart.is_map(labels)
@@ -736,7 +736,7 @@ def test_labels_that_take_too_long_to_try_are_left() -> None:
 @pytest.mark.parametrize(("loops", "most"), [(0.1, 1.1), (0.3, 1.2)])
 def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, most: float) -> None:
     """Annealing ends early, so some travels do not lead where they should."""
-    walk = maze(6, 6, steps=1200, seed=1, stars=True, loops=loops)
+    walk = maze(5, 5, steps=700, seed=1, stars=True, loops=loops)
     asked = framed_engine(walk.trace, Theory.topological())
     chart = asked._charted(len(walk.trace), None)
     assert chart

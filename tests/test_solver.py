@@ -124,7 +124,7 @@ def test_streaming_lists_no_map_twice_and_misses_none(seed: int, monkeypatch: py
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([1, 2],), "trace: expected a Trace, got"),
+        (([1, 2],), "expected a Trace"),
         ((rectangle(8), "causal"), "theory: expected a Theory, got 'causal'"),
     ],
 )
@@ -146,7 +146,7 @@ def test_arguments_of_another_kind(arguments: tuple[Any, ...], message: str) -> 
         (lambda: OnlineMapper("a", "causal"), "theory: expected a Theory, got 'causal'"),
         (lambda: OnlineMapper("a", limit="5"), "limit: expected a number of seconds above 0, got '5'"),
         (lambda: OnlineMapper("a", speedups=None), "speedups: expected Speedups, got None"),
-        (lambda: BootstrapLearner().fit(None), "trace: expected a Trace, got None"),
+        (lambda: BootstrapLearner().fit(None), "traces: expected a Trace, or a list of them, got None"),
         (lambda: check(TRACE, None), "map: expected an SSHMap, got None"),
         (lambda: solve(TRACE, memory=float("nan")), "memory (--memory-limit): expected a number of MiB above 0, got nan"),
         (lambda: solve(TRACE, limit=10**400), "limit (--time-limit): expected a number of seconds above 0, got 1000"),

@@ -55,7 +55,7 @@ def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
     return Trace.from_steps(seen, [("travel", "right")[action] for action in done])
 
 
-@settings(max_examples=70, deadline=None, derandomize=True)
+@settings(max_examples=45, deadline=None, derandomize=True)
 @given(machines(), st.sets(st.sampled_from(NAMES)), st.data())
 def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trace, off: set[str], data: st.DataObject) -> None:
     """With prefixes, patience and what is held back so small that all of it happens on short traces."""
@@ -225,7 +225,7 @@ def test_unknown_speedups_are_an_error() -> None:
         Speedups.without("magic")
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(traces(max_steps=12))
 def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
     """So they do where each step was a dstate, and these are merged while they can be."""
