@@ -7,7 +7,7 @@ Families are those of fault_cases.py; the optional ones among them are measured 
 when its CPU seconds are over. What came of it is a line of RESULTS.jsonl, and a cell that is there already is not measured again. The table is printed at the end; --show prints that of
 stored runs, and does nothing else.
 
-Ours is asked twice: which kinds of faults there are it is not told, and it is told, as RC2 always is.
+CPU seconds are until the answer is there, and proven where it is. Ours is asked twice: which kinds of faults there are it is not told, and it is told, as RC2 always is.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ from cell import cpu_seconds, end_after
 from fault_cases import FAMILIES, PRICE, Case, Explanation
 from fault_peers import PEERS
 
-from ssh_abduction import Status, Theory, solve
+from ssh_abduction import Progress, Search, SSHMap, Status, Theory
 from ssh_abduction.asp import limits
 
 OURS, TOLD = "ssh-abduction", "ssh-abduction, told the kind"
 SOLVERS = (OURS, TOLD, *PEERS)
 MARGIN = 2.0  # CPU seconds after its own limit at which a solver of ours is ended: time to hand over what it has.
+LISTING = 10.0  # CPU seconds that it has to list other maps as cheap, once its answer is proven. They do not count.
 PATIENCE = 10  # Seconds by the clock that a CPU second may take, where the machine is busy or the solver sleeps.
 AROUND = 120  # Seconds by the clock to load programs and make the trace.
 COLUMNS = (
@@ -82,7 +83,7 @@ def main() -> None:
                         if options.out:
                             with options.out.open("a") as file:
                                 file.write(json.dumps(record) + "\n")
-    print(table(records))
+    print(f"{table(records)}\n\n{cheaper(records)}")
     sys.exit("\n".join(contradictions(records)) or None)
 
 
@@ -98,46 +99,61 @@ def measured(name: str, solver: str, seed: int, limit: float, memory: int) -> Re
     process = context.Process(target=work, args=(sender, name, solver, seed, limit, memory))
     process.start()
     sender.close()
+    answer: Record = {}
     try:
-        answer = receiver.recv() if receiver.poll(PATIENCE * limit + AROUND) else {"status": "timeout", "cpu": limit}
-    except EOFError:
-        process.join()
-        answer = {"status": "timeout" if process.exitcode == -signal.SIGPROF else "error", "cpu": limit}
-    if process.is_alive() and answer["status"] == "timeout":
+        while receiver.poll(PATIENCE * limit + AROUND):
+            answer |= receiver.recv()
         process.kill()
+    except EOFError:  # it has ended
+        pass
     process.join()
-    return {**record, **answer}
+    return {**record, "status": "timeout" if process.exitcode in (-signal.SIGPROF, -signal.SIGKILL) else "error", "cpu": limit, **answer}
 
 
 def work(sender: Connection, name: str, solver: str, seed: int, limit: float, memory: int) -> None:
-    """The work of a cell's process."""
+    """The work of a cell's process: it sends what there is to find, then what it found."""
     for module in PEERS[solver].modules if solver in PEERS else ():
         importlib.import_module(module)
     case = FAMILIES[name].make(seed)
+    sender.send({"faults": len(case.faults), "true_states": case.states, "true_tenths": true_tenths(case)})
     resource.setrlimit(resource.RLIMIT_AS, (memory * 2**20, -1))
     began = cpu_seconds()
     try:
         if solver in PEERS:
             end_after(limit, signal.ITIMER_PROF)
-            answer = PEERS[solver].explain(case, limit)
-            proven = PEERS[solver].proves
+            explanation = PEERS[solver].explain(case, limit)
+            spent = round(cpu_seconds() - began, 3)
+            sender.send({"status": "ok", "cpu": spent, **judged(case, [explanation], PEERS[solver].proves)})
         else:
             vars(limits)["time"] = SimpleNamespace(perf_counter=cpu_seconds)  # the clock that a search looks at
             end_after(limit + MARGIN, signal.ITIMER_PROF)
-            solution = solve(case.walk.trace, theory_for(case, FAMILIES[name].theory, told=solver == TOLD), limit=limit)
-            proven = solution.status is Status.OPTIMAL
+            search(sender, case, theory_for(case, FAMILIES[name].theory, told=solver == TOLD), limit)
     except Exception as error:  # whatever a program raises is what came of it
-        sender.send({"status": "error", "reason": f"{type(error).__name__}: {error}"[:200], "cpu": round(cpu_seconds() - began, 3)})
-        return
-    cpu = cpu_seconds() - began
-    end_after(0, signal.ITIMER_PROF)
-    if solver in PEERS:
-        explanations = [answer]
-    else:
-        tenths = 0 if solution.cost is None else solution.cost.tenths
-        explanations = [Explanation(m.labels, frozenset((f.step, f.kind) for f in m.faults), tenths) for m in solution.maps]
-    status = "ok" if proven or solver in PEERS else "timeout"
-    sender.send({"status": status, "cpu": round(cpu, 3), **judged(case, explanations, proven)})
+        sender.send({"status": "error", "reason": f"{type(error).__name__}: {error}"[:200]})
+
+
+def search(sender: Connection, case: Case, theory: Theory, limit: float) -> None:
+    """Our search: what it found is sent when it is proven, and again when all cheapest maps are listed, for which it has LISTING seconds more."""
+    began, proven_at = cpu_seconds(), math.inf
+
+    def on_progress(progress: Progress) -> None:
+        nonlocal proven_at
+        if ours.status is Status.OPTIMAL and ours.best and progress.cost and proven_at == math.inf:
+            proven_at = cpu_seconds() - began
+            end_after(LISTING, signal.ITIMER_PROF)
+            explanations = [explained(ours.best, progress.cost.tenths)]
+            sender.send({"status": "ok", "cpu": round(proven_at, 3), **judged(case, explanations, proven=True)})
+
+    ours = Search(case.walk.trace, theory, limit=limit, on_progress=on_progress)
+    maps = tuple(ours)
+    proven = ours.status is Status.OPTIMAL
+    answer = judged(case, [explained(m, ours.cost.tenths) for m in maps if ours.cost], proven)
+    spent = min(proven_at, cpu_seconds() - began)
+    sender.send({"status": "ok" if proven else "timeout", "cpu": round(spent, 3), **answer})
+
+
+def explained(ssh_map: SSHMap, tenths: int) -> Explanation:
+    return Explanation(ssh_map.labels, frozenset((fault.step, fault.kind) for fault in ssh_map.faults), tenths)
 
 
 def theory_for(case: Case, theory: Theory, *, told: bool) -> Theory:
@@ -146,13 +162,11 @@ def theory_for(case: Case, theory: Theory, *, told: bool) -> Theory:
 
 
 def judged(case: Case, explanations: Sequence[Explanation], proven: bool) -> Record:
-    """How right explanations are, the first of which is the answer; and what it costs, beside what the truth costs, in tenths of dstates."""
-    truth = {"faults": len(case.faults), "true_states": case.states, "true_tenths": true_tenths(case)}
+    """How right explanations are, the first of which is the answer; and what that costs in tenths of dstates."""
     if not explanations:
-        return {**truth, "right": False, "among": False, "proven": False, "found": 0, "named": 0}
+        return {}
     first = explanations[0]
     return {
-        **truth,
         "right": first.is_true(case),
         "among": any(explanation.is_true(case) for explanation in explanations),
         "listed": len(explanations),
@@ -199,8 +213,7 @@ def cells(solver: str, records: Sequence[Record]) -> list[str]:
     def share(key: str) -> str:
         return f"{sum(bool(r.get(key)) for r in ran)} of {len(ran)}"
 
-    ended = [r for r in ran if "faults" in r]
-    found, faults, named = (sum(r[key] for r in ended) for key in ("found", "faults", "named"))
+    found, faults, named = (sum(r.get(key, 0) for r in ran) for key in ("found", "faults", "named"))
     seconds = [r["cpu"] if r["status"] == "ok" else math.inf for r in ran]
     limit = max(r["limit"] for r in ran)
     broke = [r for r in ran if r["status"] == "error"]
@@ -208,8 +221,8 @@ def cells(solver: str, records: Sequence[Record]) -> list[str]:
         share("right") + (f" ({len(broke)} broke)" if broke else ""),
         share("among") if solver in (OURS, TOLD) else "–",
         share("proven") if solver not in PEERS or PEERS[solver].proves else "–",
-        f"{found} of {faults}" if ended else "–",
-        f"{named - found}" if ended else "–",
+        f"{found} of {faults}",
+        f"{named - found}",
         time_of(statistics.median(seconds), limit),
         time_of(max(seconds), limit),
         rivals(ran) if solver not in PEERS else "–",
@@ -222,6 +235,18 @@ def rivals(records: Iterable[Record]) -> str:
     cheaper = sum(r["tenths"] < r["true_tenths"] for r in ended)
     ties = sum(r["proven"] and r["tenths"] == r["true_tenths"] and not r["right"] for r in ended)
     return f"{cheaper} cheaper, {ties} as cheap"
+
+
+def cheaper(records: Iterable[Record]) -> str:
+    """The cases in which ours found less than the truth costs, with what both cost, in Markdown."""
+    rows = [
+        f"| {r['family']} | {r['seed']} | {'yes' if r['solver'] == TOLD else 'no'} | {r['states']} + {r['named']} = {r['tenths'] / 10} | "
+        f"{r['true_states']} + {r['faults']} = {r['true_tenths'] / 10} | {'yes' if r['proven'] else 'no'} |"
+        for r in records
+        if r["solver"] in (OURS, TOLD) and "tenths" in r and r["tenths"] < r["true_tenths"]
+    ]
+    head = "| family | seed | told the kind | dstates + faults = cost found | dstates + faults = cost of the truth | proven |\n|---|---|---|---|---|---|"
+    return "\n".join([head, *rows])
 
 
 def time_of(seconds: float, limit: float) -> str:
