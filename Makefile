@@ -1,5 +1,6 @@
 # make demo   install what the lock says into .venv, solve a real route and show the map
 # make bench  time and memory on this machine, ours and those of peers from PyPI, as a table; the better part of an hour
+# make bench-faults  the same of faults: are they found, by ours and by peers; some hours, or ARGS="--seeds 2 --limit 10"
 # make parts  times of single parts: circuits, images, exploring step by step, and small traces
 # make test   the same, with the tools of development: lint, types, layers, tests
 PYTHON ?= python3
@@ -7,7 +8,7 @@ BIN := .venv/bin
 export PIP_CONSTRAINT := $(CURDIR)/requirements.lock
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint bench parts lock clean
+.PHONY: demo test lint bench bench-faults parts lock clean
 
 demo: .venv/base
 	$(BIN)/python examples/demo.py out
@@ -23,6 +24,9 @@ lint: .venv/dev
 
 bench: .venv/bench
 	$(BIN)/python benchmarks/bench.py $(ARGS)
+
+bench-faults: .venv/bench
+	$(BIN)/python benchmarks/faults.py $(ARGS)
 
 parts: .venv/dev
 	$(BIN)/python benchmarks/circuits.py
@@ -45,7 +49,7 @@ lock: .venv/dev
 
 # A peer that does not install is left out, and its cells of the table say so.
 .venv/bench: .venv/base
-	$(BIN)/pip install -q -e '.[bench]' || for peer in '-e .[plot]' aalpy dfainductor z3gi; do $(BIN)/pip install -q $$peer || true; done
+	$(BIN)/pip install -q -e '.[bench]' || for peer in '-e .[plot]' aalpy dfainductor python-sat z3gi; do $(BIN)/pip install -q $$peer || true; done
 	touch $@
 
 clean:

@@ -1,0 +1,257 @@
+"""Are faults found? ssh-abduction beside a MaxSAT solver, state merging that tolerates noise, and a cloned hidden Markov model.
+
+    python benchmarks/faults.py [--only PATTERN] [--solvers PATTERN] [--seeds 20] [--first 500] [--limit S] [--memory MIB] [--out RESULTS.jsonl]
+    python benchmarks/faults.py --show RESULTS.jsonl
+
+Families are those of fault_cases.py; the optional ones among them are measured only if --only finds them. A cell is one solver on one case, in a process of its own, which ends
+when its CPU seconds are over. What came of it is a line of RESULTS.jsonl, and a cell that is there already is not measured again. The table is printed at the end; --show prints that of
+stored runs, and does nothing else.
+
+CPU seconds are until the answer is there, and proven where it is. Ours is asked twice: which kinds of faults there are it is not told, and it is told, as RC2 always is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import math
+import multiprocessing
+import re
+import resource
+import signal
+import statistics
+import sys
+from collections.abc import Iterable, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from cell import cpu_seconds, end_after
+from fault_cases import FAMILIES, PRICE, Case, Explanation
+from fault_peers import PEERS
+
+from ssh_abduction import Progress, Search, SSHMap, Status, Theory
+from ssh_abduction.asp import limits
+
+OURS, TOLD = "ssh-abduction", "ssh-abduction, told the kind"
+SOLVERS = (OURS, TOLD, *PEERS)
+MARGIN = 2.0  # CPU seconds after its own limit at which a solver of ours is ended: time to hand over what it has.
+LISTING = 10.0  # CPU seconds that it has to list other maps as cheap, once its answer is proven. They do not count.
+PATIENCE = 10  # Seconds by the clock that a CPU second may take, where the machine is busy or the solver sleeps.
+AROUND = 120  # Seconds by the clock to load programs and make the trace.
+COLUMNS = (
+    "family",
+    "solver",
+    "right",
+    "among the cheapest",
+    "proven",
+    "faults found",
+    "in vain",
+    "CPU s, median",
+    "worst",
+    "truth not the only cheapest",
+)
+
+Record = dict[str, Any]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", default="", metavar="PATTERN", help="families whose name this regular expression is found in")
+    parser.add_argument("--solvers", default="", metavar="PATTERN", help="solvers whose name this regular expression is found in")
+    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="cases of each family (default 20)")
+    parser.add_argument("--first", type=int, default=500, metavar="SEED", help="the first seed (default 500)")
+    parser.add_argument("--limit", type=float, default=60, metavar="S", help="CPU seconds a cell has (default 60)")
+    parser.add_argument("--memory", type=int, default=4096, metavar="MIB", help="address space a cell has, in MiB (default 4096)")
+    parser.add_argument("--out", type=Path, metavar="RESULTS.jsonl", help="where to store what came of it")
+    parser.add_argument("--show", type=Path, metavar="RESULTS.jsonl", help="print the table of stored runs")
+    options = parser.parse_args()
+    stored = options.show or options.out
+    records: list[Record] = [json.loads(line) for line in stored.read_text().splitlines()] if stored and stored.exists() else []
+    if not options.show:
+        done = {(record["family"], record["solver"], record["seed"]) for record in records}
+        for name, family in FAMILIES.items():
+            for solver in SOLVERS:
+                wanted = re.search(options.only, name) and re.search(options.solvers, solver) and (options.only or not family.optional)
+                for seed in range(options.first, options.first + options.seeds) if wanted else ():
+                    if (name, solver, seed) not in done:
+                        record = measured(name, solver, seed, options.limit, options.memory)
+                        print(json.dumps(record), file=sys.stderr, flush=True)
+                        records.append(record)
+                        if options.out:
+                            with options.out.open("a") as file:
+                                file.write(json.dumps(record) + "\n")
+    print(f"{table(records)}\n\n{cheaper(records)}")
+    sys.exit("\n".join(contradictions(records)) or None)
+
+
+def measured(name: str, solver: str, seed: int, limit: float, memory: int) -> Record:
+    """What comes of a solver on a case: status, CPU seconds, and of its answer what `judged` says."""
+    record = {"family": name, "solver": solver, "seed": seed, "limit": limit}
+    if solver in PEERS and not PEERS[solver].installed:
+        return {**record, "status": "not installed"}
+    if FAMILIES[name].theory.level != "causal" and solver != OURS:
+        return {**record, "status": "not applicable"}
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=work, args=(sender, name, solver, seed, limit, memory))
+    process.start()
+    sender.close()
+    answer: Record = {}
+    try:
+        while receiver.poll(PATIENCE * limit + AROUND):
+            answer |= receiver.recv()
+        process.kill()
+    except EOFError:  # it has ended
+        pass
+    process.join()
+    return {**record, "status": "timeout" if process.exitcode in (-signal.SIGPROF, -signal.SIGKILL) else "error", "cpu": limit, **answer}
+
+
+def work(sender: Connection, name: str, solver: str, seed: int, limit: float, memory: int) -> None:
+    """The work of a cell's process: it sends what there is to find, then what it found."""
+    for module in PEERS[solver].modules if solver in PEERS else ():
+        importlib.import_module(module)
+    case = FAMILIES[name].make(seed)
+    sender.send({"faults": len(case.faults), "true_states": case.states, "true_tenths": true_tenths(case)})
+    resource.setrlimit(resource.RLIMIT_AS, (memory * 2**20, -1))
+    began = cpu_seconds()
+    try:
+        if solver in PEERS:
+            end_after(limit, signal.ITIMER_PROF)
+            explanation = PEERS[solver].explain(case, limit)
+            spent = round(cpu_seconds() - began, 3)
+            sender.send({"status": "ok", "cpu": spent, **judged(case, [explanation], PEERS[solver].proves)})
+        else:
+            vars(limits)["time"] = SimpleNamespace(perf_counter=cpu_seconds)  # the clock that a search looks at
+            end_after(limit + MARGIN, signal.ITIMER_PROF)
+            search(sender, case, theory_for(case, FAMILIES[name].theory, told=solver == TOLD), limit)
+    except Exception as error:  # whatever a program raises is what came of it
+        sender.send({"status": "error", "reason": f"{type(error).__name__}: {error}"[:200]})
+
+
+def search(sender: Connection, case: Case, theory: Theory, limit: float) -> None:
+    """Our search: what it found is sent when it is proven, and again when all cheapest maps are listed, for which it has LISTING seconds more."""
+    began, proven_at = cpu_seconds(), math.inf
+
+    def on_progress(progress: Progress) -> None:
+        nonlocal proven_at
+        if ours.status is Status.OPTIMAL and ours.best and progress.cost and proven_at == math.inf:
+            proven_at = cpu_seconds() - began
+            end_after(LISTING, signal.ITIMER_PROF)
+            explanations = [explained(ours.best, progress.cost.tenths)]
+            sender.send({"status": "ok", "cpu": round(proven_at, 3), **judged(case, explanations, proven=True)})
+
+    ours = Search(case.walk.trace, theory, limit=limit, on_progress=on_progress)
+    maps = tuple(ours)
+    proven = ours.status is Status.OPTIMAL
+    answer = judged(case, [explained(m, ours.cost.tenths) for m in maps if ours.cost], proven)
+    spent = min(proven_at, cpu_seconds() - began)
+    sender.send({"status": "ok" if proven else "timeout", "cpu": round(spent, 3), **answer})
+
+
+def explained(ssh_map: SSHMap, tenths: int) -> Explanation:
+    return Explanation(ssh_map.labels, frozenset((fault.step, fault.kind) for fault in ssh_map.faults), tenths)
+
+
+def theory_for(case: Case, theory: Theory, *, told: bool) -> Theory:
+    """The theory without the kinds of faults that are not there, where that is told."""
+    return theory.replace(misread=PRICE if case.wrong else 0.0, slipped=PRICE if case.jumps else 0.0) if told else theory
+
+
+def judged(case: Case, explanations: Sequence[Explanation], proven: bool) -> Record:
+    """How right explanations are, the first of which is the answer; and what that costs in tenths of dstates."""
+    if not explanations:
+        return {}
+    first = explanations[0]
+    return {
+        "right": first.is_true(case),
+        "among": any(explanation.is_true(case) for explanation in explanations),
+        "listed": len(explanations),
+        "proven": proven,
+        "found": len(first.faults & case.faults),
+        "named": len(first.faults),
+        "states": len(set(first.labels)),
+        "tenths": first.tenths,
+    }
+
+
+def true_tenths(case: Case) -> int:
+    """What the truth costs as an explanation: the true states, and as many faults as these need."""
+    if case.misseen:
+        return 10 * case.states + round(10 * PRICE) * len(case.faults)
+    return Explanation.of(case.walk.trace, case.walk.truth).tenths
+
+
+def contradictions(records: Iterable[Record]) -> list[str]:
+    """Where more than the truth costs is said to be proven the least."""
+    return [
+        f"{r['family']}, seed {r['seed']}: {r['solver']} proved {r['tenths'] / 10} to be the least, the truth costs {r['true_tenths'] / 10}"
+        for r in records
+        if r.get("proven") and r["tenths"] > r["true_tenths"]
+    ]
+
+
+def table(records: Iterable[Record]) -> str:
+    """A row for each family and solver, in Markdown."""
+    rows: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        rows.setdefault((record["family"], record["solver"]), []).append(record)
+    order = sorted(rows, key=lambda key: (list(FAMILIES).index(key[0]), SOLVERS.index(key[1])))
+    lines = [f"| {' | '.join(COLUMNS)} |", "|---" * len(COLUMNS) + "|"]
+    return "\n".join(lines + [f"| {key[0]} | {key[1]} | {' | '.join(cells(key[1], rows[key]))} |" for key in order])
+
+
+def cells(solver: str, records: Sequence[Record]) -> list[str]:
+    """What a row says of these records of one solver."""
+    ran = [r for r in records if r["status"] in ("ok", "timeout", "error")]
+    if not ran:
+        return [records[0]["status"], *["–"] * (len(COLUMNS) - 3)]
+
+    def share(key: str) -> str:
+        return f"{sum(bool(r.get(key)) for r in ran)} of {len(ran)}"
+
+    found, faults, named = (sum(r.get(key, 0) for r in ran) for key in ("found", "faults", "named"))
+    seconds = [r["cpu"] if r["status"] == "ok" else math.inf for r in ran]
+    limit = max(r["limit"] for r in ran)
+    broke = [r for r in ran if r["status"] == "error"]
+    return [
+        share("right") + (f" ({len(broke)} broke)" if broke else ""),
+        share("among") if solver in (OURS, TOLD) else "–",
+        share("proven") if solver not in PEERS or PEERS[solver].proves else "–",
+        f"{found} of {faults}",
+        f"{named - found}",
+        time_of(statistics.median(seconds), limit),
+        time_of(max(seconds), limit),
+        rivals(ran) if solver not in PEERS else "–",
+    ]
+
+
+def rivals(records: Iterable[Record]) -> str:
+    """In how many cases the answer costs less than the truth, and in how many others it is proven, costs as much, and is not the truth."""
+    ended = [r for r in records if "tenths" in r]
+    cheaper = sum(r["tenths"] < r["true_tenths"] for r in ended)
+    ties = sum(r["proven"] and r["tenths"] == r["true_tenths"] and not r["right"] for r in ended)
+    return f"{cheaper} cheaper, {ties} as cheap"
+
+
+def cheaper(records: Iterable[Record]) -> str:
+    """The cases in which ours found less than the truth costs, with what both cost, in Markdown."""
+    rows = [
+        f"| {r['family']} | {r['seed']} | {'yes' if r['solver'] == TOLD else 'no'} | {r['states']} + {r['named']} = {r['tenths'] / 10} | "
+        f"{r['true_states']} + {r['faults']} = {r['true_tenths'] / 10} | {'yes' if r['proven'] else 'no'} |"
+        for r in records
+        if r["solver"] in (OURS, TOLD) and "tenths" in r and r["tenths"] < r["true_tenths"]
+    ]
+    head = "| family | seed | told the kind | dstates + faults = cost found | dstates + faults = cost of the truth | proven |\n|---|---|---|---|---|---|"
+    return "\n".join([head, *rows])
+
+
+def time_of(seconds: float, limit: float) -> str:
+    return f"{seconds:.2f}" if seconds < math.inf else f"> {limit:g}"
+
+
+if __name__ == "__main__":
+    main()
