@@ -1,7 +1,6 @@
 """How probable an image is at each place that a recogniser knows, and how probable it is at none of them.
 
 >>> from perception.recognition import PlaceRecognizer
-from ssh_abduction.errors import brief
 >>> known = PlaceRecognizer().fit([[1.0, 4.0], [1.2, 4.0], [3.0, 3.0], [3.0, 3.1]], ["corner", "corner", "hall", "hall"])
 >>> likelihood = ImageLikelihood.of(known)
 >>> likelihood.labels([[1.1, 4.0], [3.0, 3.2], [9.0, 0.0]])
@@ -76,6 +75,12 @@ class ImageLikelihood:
             raise PerceptionError(
                 "recogniser: expected one that has learnt, got a new one; call fit with images and labels first"
             ) from None
+        with np.errstate(over="ignore", invalid="ignore"):
+            finite = np.isfinite(np.sum((images - images[:1]) ** 2))
+        if not finite:
+            raise PerceptionError(
+                "recogniser: expected one that remembers images of finite numbers, got NaN, infinity, or numbers too large to square; train it again"
+            )
         squares = np.concatenate([_to_nearest_other(images[labels == label]) for label in np.unique(labels)])
         if not len(squares):
             raise PerceptionError(

@@ -416,6 +416,7 @@ IMAGES, AT = pictures(3, 4, seed=1)
         (lambda: Localiser(RING, KNeighborsClassifier()), PerceptionError, "expected a PlaceRecognizer, or a pipeline that ends with one"),
         (lambda: Localiser(RING, recogniser().fit(IMAGES, AT + 1)), LocaliserError, "expected the dstates 0 to 2 of the map as labels"),
         (lambda: Localiser(RING, recogniser().fit(IMAGES[:3], AT[:3])), PerceptionError, "expected two images of some place"),
+        (lambda: Localiser(RING, PlaceRecognizer().fit(1e200 * IMAGES, AT)), PerceptionError, "numbers too large to square"),
         (lambda: Localiser(RING, recogniser()), PerceptionError, "expected one that has learnt, got a new one"),
         (lambda: list(Localiser(RING).beliefs(_imaged(IMAGES))), TraceError, "view: expected the views of the map, got images only"),
         (lambda: list(Localiser(RING).beliefs("t")), TraceError, "expected a Trace"),  # type: ignore[arg-type]
