@@ -16,6 +16,7 @@ from ssh_abduction.engines import paths as paths_module
 from ssh_abduction.engines import visits as same
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.engines.paths import Paths
+from ssh_abduction.guesses import annealing
 from ssh_abduction.judge.checker import check
 from ssh_abduction.steps.chart import Chart, FramedChart, numbered
 from ssh_abduction.steps.localising import Located, State, faced, located, states_of, tracked
@@ -59,7 +60,7 @@ def test_what_a_true_map_of_some_visits_says_of_the_others_is_true(seed: int) ->
     assert len(told) < 0.8 * len(states)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> None:
     """What it takes for the states of all visits is a map; and what it misses, with what led there, no state of it explains."""
     walk = maze(3, 3, steps=400, seed=seed, stars=True)
@@ -114,7 +115,8 @@ def test_the_beginning_of_a_long_trace_is_guessed(seed: int) -> None:
         return begun(self, part, check)
 
     asked = Paths(walk.trace, FRAMED)
-    with patch.object(paths_module, "FIRST_PAIRS", 300), patch.object(Paths, "_guessed", counted):
+    fewer_sweeps = patch.object(annealing, "ANNEALED", ((0.5, 700),))
+    with fewer_sweeps, patch.object(paths_module, "FIRST_PAIRS", 300), patch.object(Paths, "_guessed", counted):
         found = asked.guessed_labels(chart, Watch())
     assert guessed[0] < len(chart.stars) / 2
     assert all(later in {2 * earlier, len(chart.stars)} for earlier, later in pairwise(guessed))

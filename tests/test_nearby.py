@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Generator
+from functools import cache
+from typing import Any
 from unittest.mock import Mock, patch
 
 import pytest
@@ -135,10 +137,9 @@ def test_all_ways_are_listed_whichever_views_need_more_names() -> None:
     assert {tuple(labels) for labels in searched.listed(watch)} == {ssh_map.labels for ssh_map in expected.maps}
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_causal_maze_is_guessed_by_its_turns(seed: int) -> None:
+def test_a_causal_maze_is_guessed_by_its_turns() -> None:
     """Annealing, from views and turns alone, comes near what the robot was in; from there to the proof that no fewer dstates will do."""
-    walk = maze(3, 3, steps=1600, seed=seed)
+    walk = maze(3, 3, steps=1600, seed=1)
     log = Log(walk.trace, CAUSAL)
     chart = Chart.turned(walk.trace, log, len(log.seen))
     labels = annealed(chart).labels(chart)
@@ -155,9 +156,17 @@ def test_a_causal_maze_is_guessed_by_its_turns(seed: int) -> None:
 
 @pytest.mark.parametrize("beside", [True, False])
 def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
-    """The robot was in 100 states; what is merged at once has more."""
-    walk = maze(5, 5, steps=1600, seed=0)
+    """It has no more dstates than the states that the robot was in; what is merged at once has more than twice as many."""
+    walk = maze(4, 4, steps=800, seed=1)
     best: list[int] = []
+
+    class Awaited(Beside):
+        """The other search goes on once there is a small map: it might be through before."""
+
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            while self.running and not best:
+                time.sleep(0.001)
 
     def stop(self: NearbySearch, *_: object) -> Generator[list[int], None, str]:
         """When there is a small map, the time is over."""
@@ -169,18 +178,18 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
         yield []
         return "open"
 
-    limited = solver.Search(walk.trace, CAUSAL)
+    limited = solver.Search(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"))
     truth = {state: number for number, state in enumerate(dict.fromkeys(walk.truth))}
     with (
         patch.object(named, "annealed", lambda *_, **__: Mock(labels=lambda chart: _labels_of(chart, walk.truth, truth))),
         patch.object(NearbySearch, "_asked", stop),
-        patch.multiple(named, PATIENCE=100, CORES=100),
+        patch.multiple(named, PATIENCE=1, CORES=1, Beside=Awaited),
         patch.object(engine.Task, "has_processors", beside),
     ):
         solution = limited.solution(tuple(limited))
     assert solution.stopped == "interrupted"
     assert solution.cost
-    assert solution.cost.dstates == best[0] <= 100
+    assert solution.cost.dstates == best[0] <= len(truth) < len(set(Log(walk.trace, CAUSAL).merged())) / 2
     assert check(walk.trace, solution.maps[0], CAUSAL) == ()
 
 
@@ -211,9 +220,9 @@ def test_where_clingo_would_prepare_for_too_long_the_search_beside_goes_on() -> 
 def test_a_search_of_the_whole_trace_keeps_no_time_back() -> None:
     """What is kept back is for that search; to begin it once more would throw away what it has come to."""
     with patch.object(solver.Search, "_salvage", side_effect=AssertionError):
-        solution = solve(maze(10, 10, steps=1000, seed=0, stars=True).trace, limit=2)
+        solution = solve(maze(10, 10, steps=1000, seed=0, stars=True).trace, limit=1)
     assert solution.stopped == "time limit"
-    assert solution.seconds.total > 1.9
+    assert solution.seconds.total > 0.9
 
 
 def _labels_of(chart: Chart, states: tuple[object, ...], number: dict[object, int]) -> list[int]:
@@ -267,6 +276,13 @@ def test_what_turns_of_any_kind_show_is_put_together() -> None:
     assert chart.stars == ((a, b, c, d), (c, d, a, b))
 
 
+@cache
+def fewest_dstates(trace: Trace) -> int:
+    cost = solve(trace, CAUSAL).cost
+    assert cost
+    return cost.dstates
+
+
 @pytest.mark.parametrize(("first", "guessed", "goes_on"), [(1200, 0, True), (20, 0, False), (20, 1601, True), (300, 0, True)])
 def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(first: int, guessed: int, goes_on: bool) -> None:
     """Of 1,200 steps in a maze of 9 cells the map holds to the end, and of 300 or 600 it lacks links; of 20 and 40 steps it is of no use, but where
@@ -280,16 +296,15 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(first: int, 
     with patch.multiple(named, AT_ONCE=first, GUESSED=guessed):
         found = list(long._from_beginning(watch.check))
     assert bool(found) == goes_on
-    fewest = solve(trace, CAUSAL).cost
-    assert fewest
+    fewest = fewest_dstates(trace)
     for labels in found:
         assert check(trace, facts.causal_map(labels, trace), CAUSAL) == ()
-    assert min(len(set(labels)) for labels in found or [range(fewest.dstates)]) == fewest.dstates
+    assert min(len(set(labels)) for labels in found or [range(fewest)]) == fewest
 
 
 def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
     """The simplest first, so that it comes to an end before it was given all; the map is that of a guess at the beginning, or clingo's."""
-    walk = maze(4, 4, steps=4000, seed=1, loops=0.3)
+    walk = maze(3, 3, steps=2000, seed=1, loops=0.3)
     given: list[int] = []
     add = named.NamedLabels.add
 
@@ -298,12 +313,12 @@ def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
         given.append(len(self._links))
 
     expected = solve(walk.trace, CAUSAL)
-    with patch.multiple(named, AT_ONCE=1000, PATIENCE=10, MORE_LINKS=100), patch.object(named.NamedLabels, "add", counted):
+    with patch.multiple(named, AT_ONCE=500, PATIENCE=10, MORE_LINKS=50), patch.object(named.NamedLabels, "add", counted):
         found = solve(walk.trace, CAUSAL)
     assert found.status is expected.status is Status.OPTIMAL
     assert found.cost == expected.cost
     assert check(walk.trace, found.maps[0], CAUSAL) == ()
-    assert 100 < max(given) < 4000
+    assert 100 < max(given) < 2000
 
 
 def test_of_a_long_trace_as_much_is_taken_as_adds_to_the_clique() -> None:

@@ -22,6 +22,7 @@ from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Action, Odometry, OnlineMapper, Solution, SSHMap, Status, Step, Theory, TheoryError, Trace, TraceError, solve
 from ssh_abduction.engines.base import Task
+from ssh_abduction.guesses import annealing
 from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import check
 from ssh_abduction.online import background as guessing
@@ -65,7 +66,7 @@ def agree(trace: Trace, theory: Theory) -> None:
             assert getattr(answer.cost, name) == getattr(anew.cost, name)
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=14, deadline=None, derandomize=True)
 @given(st.data())
 def test_after_every_step_the_answer_is_that_of_solving_anew(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=9), label="trace")
@@ -77,7 +78,7 @@ def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
     agree(Trace.from_steps("abaabb", ["travel", "around", "travel", "right", "travel"]), Theory(without=(name,)))
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=12, deadline=None, derandomize=True)
 @given(st.data())
 def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
@@ -126,7 +127,7 @@ def test_a_mapper_says_how_far_it_is() -> None:
     assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.data())
 def test_sketches_are_consistent(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=14), label="trace").without_displacements()  # what evidence says, a sketch does not know
@@ -178,7 +179,7 @@ def test_a_map_goes_on_through_a_maze(stars: bool) -> None:
     assert {*doubts} == {True, False}
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=15, deadline=None, derandomize=True)
 @given(st.data())
 def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=9), label="trace")
@@ -243,7 +244,7 @@ def test_maps_are_guessed_while_the_robot_drives() -> None:
 def test_a_map_that_is_contradicted_is_mended() -> None:
     """Maps of fewer steps, kept as far as can be: what does not fit is new. That has streets mostly."""
     without = contradicted = 0
-    for seed in range(10):
+    for seed in range(6):
         trace = maze(3, 3, steps=120, seed=seed, stars=True).trace
         theory = Theory.topological().resolve(trace)
         first = 25 + 5 * seed
@@ -259,7 +260,7 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
                 assert found.labels == predicted
             contradicted += len(found.dstates) > len(known.dstates)
             assert len(found.dstates) < len(Chart.framed(trace.prefix(steps), Log(trace.prefix(steps), theory)).seen)
-    assert without < 5 < contradicted
+    assert without < 3 < contradicted
 
 
 @pytest.mark.parametrize("off", ["annealed", "threads", "processes"])
@@ -391,7 +392,7 @@ def test_displacements_may_be_asked_for_before_the_first_one_comes() -> None:
 
 def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
     """Without time for clingo, all maps are guessed or sketched, and displacements refuse none of them: not even those of steps before the threshold changed."""
-    trace = maze(4, 4, steps=80, seed=1, stars=True, odometry=Odometry(along=0.02)).trace
+    trace = maze(4, 4, steps=60, seed=1, stars=True, odometry=Odometry(along=0.02)).trace
     given: list[Trace] = []
 
     def guessed_map(trace: Trace, *others: Any) -> SSHMap | None:
@@ -404,7 +405,8 @@ def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
     with (
         patch.object(guessing, "has_processors", lambda _: True),
         patch.object(guessing, "in_process", at_once),
-        patch.object(online, "GUESSED", 50),
+        patch.object(online, "GUESSED", 40),
+        patch.object(annealing, "ANNEALED", ((0.5, 50),)),
     ):
         mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, odometry=trace.odometry, limit=NO_TIME)
         for action, step in zip(trace.actions, trace.steps[1:], strict=True):

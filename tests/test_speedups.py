@@ -116,7 +116,7 @@ CASES = {
     "causal": (moore(6, 2, steps=60, seed=1).trace, Theory.causal()),
     "topological": (CIRCUITS, Theory.topological()),
     "circumscriptive": (CIRCUITS, Theory.circumscriptive()),
-    "framed": (maze(3, 3, steps=60, seed=0, stars=True).trace, Theory.topological()),
+    "framed": (maze(3, 3, steps=40, seed=0, stars=True).trace, Theory.topological()),
     "frameless": (maze(2, 2, steps=30, seed=1).trace, Theory.topological()),
 }
 
@@ -128,6 +128,7 @@ def hurried() -> Iterator[None]:
         patch.multiple(solver, FEW_STEPS=0, FRAME_AFTER=-1.0),
         patch.multiple(named, PATIENCE=0, CORES=0),
         patch.multiple(framed, SOON=-1.0, GUESS_FIRST=-1.0),
+        patch.object(annealing, "ANNEALED", ((0.5, 50),)),
     ):
         yield
 
