@@ -87,7 +87,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         self.clusterer_ = as_view_clusterer(ViewClusterer(random_state=0) if self.clusterer is None else clone(self.clusterer)).fit(images)
         self.views_, self.confidence_ = self.clusterer_.labels_, self.clusterer_.confidence_
         warn_of_doubts(self.views_, self.confidence_, self.clusterer_.quality_[self.clusterer_.k_])
-        return traces.with_views(images, self.views_, self.clusterer_.runner_up_labels_)
+        return traces.with_views(images, self.views_, self.clusterer_.runner_up_labels_, self.confidence_)
 
     def _followed(self, traces: Traces, looks: NDArray[np.intp]) -> NDArray[np.intp]:
         """The dstate of each step, by the map: -1 where it does not tell. `looks` are the dstates that the images look like."""

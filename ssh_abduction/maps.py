@@ -101,12 +101,14 @@ class Fault:
               name says, so that nothing links this step and the next one
     seen      the view, None for a star; or the name of the action
     expected  the view of the dstate; None for stars and actions
+    cost      what it costs, in dstates
     """
 
     step: int
     kind: Literal["misread", "misseen", "slipped"]
     seen: View | None = None
     expected: View | None = None
+    cost: float = field(default=0.0, compare=False)
 
     def __str__(self) -> str:
         if self.kind == "misread":
@@ -438,7 +440,7 @@ class _Reader:
             view = record.get(part)
             if isinstance(view, bool) or not isinstance(view, str | int | None) or (isinstance(view, str) and not is_writable(view)):
                 raise self.wrong(f"{name}.{part}", "a text or an integer", view)
-        return Fault(step, record["kind"], record.get("seen"), record.get("expected"))
+        return Fault(step, record["kind"], record.get("seen"), record.get("expected"), self.number(record.get("cost", 0), f"{name}.cost"))
 
     def fit(self, record: Mapping[str, Any], dstates: int) -> Fit | None:
         if record.get("fit") is None:

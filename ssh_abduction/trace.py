@@ -34,7 +34,7 @@ FORMAT, VERSION = "ssh-trace", 1
 LONGEST_LINE = 16 * 2**20
 _KINDS = ("travel", "turn")
 _TURNS = ("right", "left", "around")
-_STEP_FIELDS = ("view", "image", "action", "star", "displacement", "covariance", "truth")
+_STEP_FIELDS = ("view", "image", "action", "star", "displacement", "covariance", "truth", "confidence")
 _ACTION_FIELDS = ("name", "kind", "turn", "gateway", "bearing")
 _QUARTERS = (None, "right", "around", "left")
 
@@ -129,6 +129,7 @@ class Step:
     covariance    of the displacement, (3, 3); where it is missing, the trace's odometry tells it
     image         ranges in metres, or an index into the header's sidecar file
     truth         for evaluation only; nothing that infers reads it
+    confidence    how probable it is that the view, and the star, are right, from 0 to 1; where faults are allowed, it scales what it costs to disbelieve them
     """
 
     view: View | None = None
@@ -139,10 +140,13 @@ class Step:
     image: tuple[float, ...] | int | None = None
     truth: Any = field(default=None, hash=False)
     extra: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    confidence: float | None = None
 
     def __post_init__(self) -> None:
         if self.view is not None:
             _view(self.view, "view")
+        if self.confidence is not None:
+            object.__setattr__(self, "confidence", _probability(self.confidence, "confidence"))
         if self.star is not None:
             parse_star(self.star, "star")
         if self.displacement is not None:
@@ -198,6 +202,7 @@ class Step:
             "displacement": list(self.displacement) if self.displacement is not None else None,
             "covariance": [list(row) for row in self.covariance] if self.covariance is not None else None,
             "truth": self.truth,
+            "confidence": self.confidence,
         }
         return {**{k: v for k, v in known.items() if v is not None}, **self.extra}
 
@@ -330,13 +335,20 @@ class Trace:
         """The same trace, as if the robot had no odometry."""
         return replace(self, steps=tuple(replace(step, displacement=None, covariance=None) for step in self.steps), odometry=None)
 
-    def with_views(self, views: Iterable[View]) -> Trace:
-        """This trace with these views, one for each step. Raises TraceError."""
+    def with_views(self, views: Iterable[View], confidences: Iterable[float | None] | None = None) -> Trace:
+        """This trace with these views, and perhaps how probable it is that each is right, one for each step. Raises TraceError."""
         seen = _listed(views, "views")
-        if len(seen) != len(self):
-            raise TraceError(f"views: expected {len(self)}, one a step, got {len(seen)}")
+        sure = [None] * len(seen) if confidences is None else _listed(confidences, "confidences")
+        for name, values in (("views", seen), ("confidences", sure)):
+            if len(values) != len(self):
+                raise TraceError(f"{name}: expected {len(self)}, one a step, got {len(values)}")
+        checked = [
+            (_view(view, f"views[{i}]"), None if c is None else _probability(c, f"confidences[{i}]"))
+            for i, (view, c) in enumerate(zip(seen, sure, strict=True))
+        ]
         return replace(
-            self, steps=tuple(replace(s, view=_view(v, f"views[{i}]")) for i, (s, v) in enumerate(zip(self.steps, seen, strict=True)))
+            self,
+            steps=tuple(replace(step, view=view, confidence=c) for step, (view, c) in zip(self.steps, checked, strict=True)),
         )
 
     def prefix(self, steps: int) -> Trace:
@@ -501,7 +513,17 @@ def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> 
     star = parse_star(record["star"], f"{where}: star") if record.get("star") is not None else None
     extra = {k: v for k, v in record.items() if k not in _STEP_FIELDS}
     try:
-        return Step(view, action, star, record.get("displacement"), record.get("covariance"), image, record.get("truth"), extra)
+        return Step(
+            view,
+            action,
+            star,
+            record.get("displacement"),
+            record.get("covariance"),
+            image,
+            record.get("truth"),
+            extra,
+            record.get("confidence"),
+        )
     except TraceError as error:
         raise TraceError(f"{where}: {error}") from None
 
@@ -534,6 +556,12 @@ def _view(value: Any, where: str) -> View:
     if isinstance(value, str) and not is_writable(value):
         raise TraceError(f"{where}: expected a text that UTF-8 can hold, got half a character in {brief(value)}; rename the view")
     return value
+
+
+def _probability(value: Any, where: str) -> float:
+    if not is_finite(value) or not 0 <= value <= 1:
+        raise TraceError(f"{where}: expected a probability from 0 to 1, got {brief(value)}; leave it out where none is known")
+    return float(value)
 
 
 def _action(value: Any, where: str) -> Action:

@@ -64,8 +64,15 @@ class Traces:
         """What is told of all steps, (n, …), trace by trace."""
         return np.split(of_all, np.cumsum([len(trace) for trace in self.each])[:-1])
 
-    def with_views(self, images: NDArray[np.float64], views: Integers, second: Integers | None) -> Traces:
-        """These traces with views, (n,), and, where there is a runner-up, with its views. Noise has the view of the nearest centre among the images, (n, d)."""
-        seen = [t.with_views(v.tolist()) for t, v in zip(self.each, self.parts(nearest_views(images, views)), strict=True)]
+    def with_views(
+        self, images: NDArray[np.float64], views: Integers, second: Integers | None, sure: NDArray[np.float64] | None = None
+    ) -> Traces:
+        """These traces with views, (n,), how sure they are, (n,), and, where there is a runner-up, its views.
+
+        Noise has the view of the nearest centre among the images, (n, d), and the confidence 0.
+        """
+        of_steps = np.ones(len(images)) if sure is None else sure.round(4)
+        parts = zip(self.each, self.parts(nearest_views(images, views)), self.parts(of_steps), strict=True)
+        seen = [trace.with_views(part.tolist(), None if sure is None else c.tolist()) for trace, part, c in parts]
         others = [None] * len(seen) if second is None else [part.tolist() for part in self.parts(second)]
         return Traces(tuple(with_runner_up(t, other) for t, other in zip(seen, others, strict=True)))

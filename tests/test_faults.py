@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import faulty_machine
 
-from ssh_abduction import OnlineMapper, Speedups, Status, Theory, Trace, solve
+from ssh_abduction import OnlineMapper, Speedups, Status, Step, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.engines import faulty
 from ssh_abduction.errors import MapError, TheoryError
@@ -33,7 +33,16 @@ Told = tuple[tuple[int, ...], frozenset[tuple[int, str, object]]]  # the labels 
 def small_traces(draw: st.DrawFn, max_steps: int = 6) -> Trace:
     steps = draw(st.integers(1, max_steps))
     seen = draw(st.lists(st.sampled_from("ab"), min_size=steps, max_size=steps))
-    return Trace.from_steps(seen, draw(st.lists(st.sampled_from(["travel", "right"]), min_size=steps - 1, max_size=steps - 1)))
+    trace = Trace.from_steps(seen, draw(st.lists(st.sampled_from(["travel", "right"]), min_size=steps - 1, max_size=steps - 1)))
+    return trace.with_views(seen, draw(st.lists(st.sampled_from([None, None, 0.9, 0.4]), min_size=steps, max_size=steps)))
+
+
+# What the confidences of these traces make of a price, as a share of it: log(0.9 / 0.1) / log 99, and the least one.
+SHARE = {None: 1.0, 0.9: 0.478, 0.4: 0.1}
+
+
+def price_of(misread: int, step: Step) -> int:
+    return max(round(misread * SHARE[step.confidence]), 1)
 
 
 def partitions(steps: int) -> Iterator[tuple[int, ...]]:
@@ -61,7 +70,7 @@ def cheapest(trace: Trace, misread: int, slipped: int) -> tuple[int | None, set[
                 slips = frozenset((t, "slipped", None) for t, a in enumerate(trace.actions) if goes[labels[t], a.name] != labels[t + 1])
                 if (wrong and not misread) or (slips and not slipped):
                     continue
-                cost = 10 * len(views) + misread * len(wrong) + slipped * len(slips)
+                cost = 10 * len(views) + sum(price_of(misread, trace.steps[t]) for t, _, _ in wrong) + slipped * len(slips)
                 if best is None or cost < best:
                     best, maps = cost, set()
                 if cost == best:
@@ -109,12 +118,12 @@ def test_topological_maps_are_those_of_corrected_traces(trace: Trace, misread: f
     best: tuple[int, ...] | None = None
     expected: set[object] = set()
     for views in product("ab", repeat=len(trace)):
-        wrong = sum(a != b for a, b in zip(views, trace.views, strict=True))
+        wrong = sum(price_of(round(10 * misread), step) for a, step in zip(views, trace.steps, strict=True) if a != step.view)
         corrected = replace(trace, steps=tuple(replace(step, view=view) for step, view in zip(trace.steps, views, strict=True)))
         counts, maps = minimal_maps(corrected, theory)
         if counts is None:
             continue
-        cost = 10 * counts.dstates + round(10 * misread) * wrong, counts.paths, counts.places
+        cost = 10 * counts.dstates + wrong, counts.paths, counts.places
         seen = {(k, views) for k in maps if all(any(x == s and views[t] == trace.views[t] for t, x in enumerate(k[0])) for s in k[0])}
         if seen and (best is None or cost < best):
             best, expected = cost, set()
@@ -169,6 +178,7 @@ def test_the_checker_judges_faults_itself() -> None:
         (*ssh_map.faults, *ssh_map.faults),
         (*ssh_map.faults, Fault(3, "slipped", "travel")),
         (*ssh_map.faults, Fault(99, "misread", "v0", "v1")),
+        (replace(ssh_map.faults[0], cost=0.1),),
     ):
         assert check(RECTANGLE, replace(ssh_map, faults=faults), theory)
     with pytest.raises(MapError, match=r"faults\[0\].kind: expected misread or misseen or slipped"):
@@ -201,11 +211,26 @@ def test_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkey
     text = capsys.readouterr().out
     Path("maps.json").write_text(text)
     answer = json.loads(text)
-    assert answer["maps"][0]["faults"] == [{"step": 9, "kind": "misread", "seen": "v0", "expected": "v1"}]
+    assert answer["maps"][0]["faults"] == [{"step": 9, "kind": "misread", "seen": "v0", "expected": "v1", "cost": 1.5}]
     assert answer["cost"]["faults"] == 1.5
     assert main(["check", "trace.jsonl", "maps.json"]) == 0
     assert main(["check", "--bound", "trace.jsonl", "maps.json"]) == 1
     assert "bound: expected a theory without faults" in capsys.readouterr().err
+
+
+def test_confidence_scales_what_a_fault_costs() -> None:
+    """0.99 costs the whole price, as does a step without one; the log odds of the others are its share, between a tenth and five times."""
+    shares = {None: 15, 0.99: 15, 0.9: 7, 0.6: 2, 0.5: 2, 0.0: 2, 0.999: 23, 1.0: 75}
+    assert {c: Theory(misread=1.5).fault_tenths("misread", Step("a", confidence=c)) for c in shares} == shares
+    assert Theory(slipped=3).fault_tenths("slipped", Step("a", confidence=0.5)) == 30
+    assert Theory().fault_tenths("misread", Step("a", confidence=0.5)) == 0
+    doubtful = RECTANGLE.with_views(RECTANGLE.views, [0.6 if t == 9 else None for t in range(25)])
+    theory = Theory.causal().replace(misread=9.3)
+    assert solve(RECTANGLE, theory).cost.faults == 0  # type: ignore[union-attr]
+    solution = solve(doubtful, theory)
+    assert [(fault.step, fault.cost) for fault in solution.maps[0].faults] == [(9, 0.9)]
+    assert solution.cost is not None
+    assert solution.cost.faults == 0.9
 
 
 def test_the_front_is_what_brute_force_finds() -> None:

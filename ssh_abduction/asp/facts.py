@@ -40,7 +40,7 @@ def theory_facts(theory: Theory, paths: int) -> str:
     facts += [f"path(1..{paths})."] if theory.level == "topological" else []
     facts += _preferred(theory)
     facts += ["defeasible."] if theory.boundary == "defeasible" else []
-    facts += [f"allowed({kind}). price({kind},{round(10 * price)})." for kind in EXCUSED if (price := getattr(theory, kind))]
+    facts += [f"allowed({kind})." for kind in EXCUSED if getattr(theory, kind)]
     return "\n".join(facts)
 
 
@@ -77,6 +77,10 @@ def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
             facts += [f"open({t},{slot})." for slot, is_open in enumerate(step.openings or ()) if is_open]
     done = {t: trace.actions[t] for t in range(max(start - 1, 0), stop - 1)}
     facts += [f"act({t},{_constant(action.name)})." for t, action in done.items()]
+    if theory.misread:
+        facts += [f"price(misread,{t},{theory.fault_tenths('misread', trace.steps[t])})." for t in range(start, stop)]
+    if theory.slipped:
+        facts += [f"price(slipped,{t},{theory.fault_tenths('slipped', trace.steps[t])})." for t in done]
     if theory.level == "topological":
         facts += [_kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None]
     if theory.star == "gateways":
@@ -185,7 +189,7 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
     if theory.star == "gateways":
         found = frames.Frames(trace, len(is_at)).frames
         heading = {t: frames.heading(found[shape[p]], found[shape[t]], heading[t]) for t, p in place.items()}
-    return _map(trace, is_at, place, course, heading, before, excused, faults)
+    return _map(trace, is_at, place, course, heading, before, excused, faults, theory)
 
 
 def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
@@ -207,6 +211,7 @@ def _map(
     before: Iterable[tuple[int, int, int]],
     excused: Iterable[tuple[int, int]] = (),
     faults: Sequence[tuple[int, str]] = (),
+    theory: Theory | None = None,
 ) -> SSHMap:
     """The map of these dstates, places, courses and headings of steps; dstates and places are named by the first step at them."""
     views = views_of(is_at, trace, faults)
@@ -234,7 +239,7 @@ def _map(
         places=tuple(place_of.values()),
         paths=_paths(len(path_of), dstates, pairs),
         excused=tuple(sorted((path_of[h], path_of[g]) for h, g in excused if h in path_of and g in path_of)),
-        faults=faults_of(faults, is_at, views, trace),
+        faults=() if theory is None else faults_of(faults, is_at, views, trace, theory),
     )
 
 
@@ -252,16 +257,19 @@ def views_of(labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int
     return views
 
 
-def faults_of(faults: Iterable[tuple[int, str]], labels: Mapping[int, int], views: Mapping[int, View], trace: Trace) -> tuple[Fault, ...]:
+def faults_of(
+    faults: Iterable[tuple[int, str]], labels: Mapping[int, int], views: Mapping[int, View], trace: Trace, theory: Theory
+) -> tuple[Fault, ...]:
     """The faults as a map tells them."""
     found = []
     for t, kind in sorted(faults):
+        cost = theory.fault_tenths(kind, trace.steps[t]) / 10
         if kind == "misread":
-            found.append(Fault(t, "misread", _view(trace, t), views[labels[t]]))
+            found.append(Fault(t, "misread", _view(trace, t), views[labels[t]], cost))
         elif kind == "slipped":
-            found.append(Fault(t, "slipped", trace.actions[t].name))
+            found.append(Fault(t, "slipped", trace.actions[t].name, cost=cost))
         else:
-            found.append(Fault(t, "misseen"))
+            found.append(Fault(t, "misseen", cost=cost))
     return tuple(found)
 
 
@@ -534,14 +542,14 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
     return SSHMap(found, tuple(DState(i, _view(trace, t)) for i, t in enumerate(first)), links_of(found, trace))
 
 
-def faulty_map(labels: Sequence[int], trace: Trace, faults: Sequence[tuple[int, str]]) -> SSHMap:
+def faulty_map(labels: Sequence[int], trace: Trace, faults: Sequence[tuple[int, str]], theory: Theory) -> SSHMap:
     """The map of the causal level that these labels make, where some steps are disbelieved; dstates are numbered by first visit."""
     number: dict[int, int] = {}
     found = tuple(number.setdefault(label, len(number)) for label in labels)
     is_at = dict(enumerate(found))
     views = views_of(is_at, trace, faults)
     dstates = tuple(DState(i, views[i]) for i in range(len(number)))
-    return SSHMap(found, dstates, links_of(found, trace, faults), faults=faults_of(faults, is_at, views, trace))
+    return SSHMap(found, dstates, links_of(found, trace, faults), faults=faults_of(faults, is_at, views, trace, theory))
 
 
 def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
@@ -564,15 +572,13 @@ def at_most_faults(most: int) -> str:
     return f":- #count {{ T,misread : misreads(T); T,slipped : slips(T) }} > {most}."
 
 
-def faulty_base(actions: Iterable[int], names: Mapping[int, int], price: Mapping[str, int], *, free: bool = False) -> str:
-    """The names of dstates, the actions, and what faults cost, as facts for faulty.lp.
+def faulty_base(actions: Iterable[int], names: Mapping[int, int], kinds: Iterable[str]) -> str:
+    """The names of dstates, the actions, and the kinds of faults that may be, as facts for faulty.lp.
 
     names  how many names each view has, beside the rest
-    price  tenths of dstates for each kind of fault; 0 where there are none
-    free   whether faults cost nothing
     """
     found = [f"action({action})." for action in sorted(set(actions))]
-    found += [f"price({kind},{0 if free else tenths})." for kind, tenths in price.items() if tenths]
+    found += [f"allowed({kind})." for kind in kinds]
     for view, some in groupby(faulty_names(names), key=itemgetter(1)):
         of_view = [name for name, _ in some]
         found += [f"view({name},{view})." for name in of_view]
@@ -581,9 +587,18 @@ def faulty_base(actions: Iterable[int], names: Mapping[int, int], price: Mapping
     return "\n".join(found)
 
 
-def faulty_batch(batch: int, seen: Sequence[int], actions: Sequence[int], steps: Sequence[int], known: Sequence[int], pairs: Pairs) -> str:
+def faulty_batch(
+    batch: int,
+    seen: Sequence[int],
+    actions: Sequence[int],
+    steps: Sequence[int],
+    known: Sequence[int],
+    pairs: Pairs,
+    price: Mapping[str, Sequence[int]],
+) -> str:
     """These steps of a trace as a batch of facts for faulty.lp.
 
+    price  tenths of dstates for each kind of fault that may be, at each step
     steps  in the order in which they are given
     known  those that were given before, in that order
     """
@@ -593,6 +608,7 @@ def faulty_batch(batch: int, seen: Sequence[int], actions: Sequence[int], steps:
     found += [f"next({batch},{t},{u})." for t, u in pairwise([*known[-1:], *steps])]
     links = sorted({t for step in steps for t in (step - 1, step) if t in given and t + 1 in given})
     found += [f"link({batch},{t},{actions[t]},{t + 1})." for t in links]
+    found += [f"price({kind},{t},{tenths[t]})." for kind, tenths in price.items() for t in (steps if kind == "misread" else links)]
     for t in given:
         found += [f"excluded({batch},{i},{t})." for i in pairs.apart.get(t, ()) if i in given and (i in new or t in new)]
         found += [f"one({batch},{i},{t})." for i in pairs.one.get(t, ()) if i in given and (i in new or t in new)]

@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
         uncertainty = {k: uncertainty_coefficient(labels, truth) for k, labels in clusterer.labels_by_k_.items()}
     beside = trace.images and os.path.relpath(Path(trace.source or ".").parent / trace.images, Path(options.output).parent)
     other = clusterer.runner_up_labels_
-    clustered = replace(trace.with_views(clusterer.labels_.tolist()), images=beside)
+    clustered = replace(trace.with_views(clusterer.labels_.tolist(), clusterer.confidence_.round(4).tolist()), images=beside)
     clustered = with_runner_up(clustered, None if other is None else other.tolist())
     rows = [
         [

@@ -33,9 +33,8 @@ class Cost:
     faults: float = 0.0
 
     @staticmethod
-    def of(ssh_map: SSHMap, theory: Theory | None = None) -> Cost:
-        price = {"misread": theory.misread, "misseen": theory.misread, "slipped": theory.slipped} if theory else {}
-        faults = sum(round(10 * price.get(fault.kind, 0.0)) for fault in ssh_map.faults) / 10
+    def of(ssh_map: SSHMap) -> Cost:
+        faults = sum(round(10 * fault.cost) for fault in ssh_map.faults) / 10
         return Cost(len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.excused), faults)
 
     @property
@@ -56,7 +55,7 @@ class Cost:
 def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> Cost:
     """The counts of a map: those that the theory prefers as clingo counted them, since it may count more than the map can show where axioms are left out."""
     counted = {name: count for name, count in zip(theory.priorities, cost, strict=True) if name != "tenths"}
-    return replace(Cost.of(ssh_map, theory), **counted)
+    return replace(Cost.of(ssh_map), **counted)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +68,7 @@ class Found:
     @staticmethod
     def of(ssh_map: SSHMap, theory: Theory) -> Found:
         """A map and its counts, which it shows, as no axiom is left out."""
-        return Found(ssh_map, Cost.of(ssh_map, theory).preferred_by(theory))
+        return Found(ssh_map, Cost.of(ssh_map).preferred_by(theory))
 
 
 @dataclass(frozen=True)

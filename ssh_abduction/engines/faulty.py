@@ -31,6 +31,7 @@ PLACES = 12  # Steps around so many of those that the Viterbi pass disbelieves a
 NAMES = 3  # So many names a view has at first.
 MORE_NAMES = 2  # So many more it is given where its rest is used.
 OPTIONS = ("--opt-strategy=usc,stratify",)
+NEVER = 1_000_000  # What the Viterbi pass pays for faults of a kind that may not be.
 UNKNOWN = 0.5  # What the Viterbi pass pays, in tenths of dstates, where the map does not know where an action leads: less than any fault.
 
 
@@ -77,7 +78,12 @@ class FaultyEngine:
         self.bound: int | None = None
         self._task = task
         self._seen, self._actions = task.log.seen, task.log.actions
-        self._price = {kind: round(10 * getattr(task.theory, kind)) for kind in ("misread", "slipped")}
+        # Tenths of dstates for each kind of fault that may be, at each step.
+        self._price = {
+            kind: [task.theory.fault_tenths(kind, step) for step in task.trace.steps]
+            for kind in ("misread", "slipped")
+            if getattr(task.theory, kind)
+        }
         self._names = dict.fromkeys(range(max(self._seen) + 1), NAMES)
         self._given: set[int] = set()
         self._forbidden: list[Collection[Equality]] = []
@@ -179,16 +185,14 @@ class FaultyEngine:
                 self._batches = self._ruled = 0
                 self.asker.control = Control(OPTIONS, self.asker.watch.check)
                 self.asker.control.load_encodings("faulty")
-                self.asker.control.add(
-                    "base", [], facts.faulty_base(self._actions, self._names, self._price, free=self._most_faults is not None)
-                )
+                self.asker.control.add("base", [], facts.faulty_base(self._actions, self._names, self._price))
                 self.asker.control.ground([("base", [])])
             control = self.asker.control
             if new := sorted(self._given.difference(self._told)):
                 batch = self._batches
-                control.add(
-                    f"batch_{batch}", [], facts.faulty_batch(batch, self._seen, self._actions, new, self._told, self._task.log.pairs)
-                )
+                price = self._price if self._most_faults is None else {kind: [0] * len(self._seen) for kind in self._price}
+                told = facts.faulty_batch(batch, self._seen, self._actions, new, self._told, self._task.log.pairs, price)
+                control.add(f"batch_{batch}", [], told)
                 control.ground([(f"batch_{batch}", []), ("more", facts.numbers(batch))])
                 if self._most_faults is not None:
                     control.add(f"most_{batch}", [], facts.at_most_faults(self._most_faults))
@@ -281,7 +285,7 @@ class FaultyEngine:
         slips = frozenset(t for t in range(self.size - 1) if goes[labels[t], self._actions[t]] != labels[t + 1])
         right = {labels[t] for t in range(self.size)} - {labels[t] for t in misread}
         seen_right = right | {labels[t] for t in range(self.size) if shows[labels[t]] == self._seen[t]}
-        if (misread and not self._price["misread"]) or (slips and not self._price["slipped"]) or set(labels) - seen_right:
+        if (misread and "misread" not in self._price) or (slips and "slipped" not in self._price) or set(labels) - seen_right:
             return None
         if self._task.log.pairs.broken_by(labels) or (self._most_faults is not None and len(misread) + len(slips) > self._most_faults):
             return None
@@ -289,9 +293,10 @@ class FaultyEngine:
 
     def _viterbi(self, shows: Sequence[int], goes: Mapping[tuple[int, int], int]) -> tuple[list[int], list[int], list[int]]:
         """The dstates of all steps with the fewest faults; the steps whose action is not known there; and the steps with a fault."""
-        count, never = len(shows), 1e6
-        slip, misread = (float(self._price[kind] or never) for kind in ("slipped", "misread"))
-        moves = np.full((max(self._actions, default=0) + 1, count, count), slip)
+        count = len(shows)
+        prices = (np.array(self._price.get(kind, [NEVER] * self.size), dtype=float) for kind in ("slipped", "misread"))
+        slip, misread = prices
+        moves = np.full((max(self._actions, default=0) + 1, count, count), slip[0])
         for action in range(len(moves)):
             for s in range(count):
                 target = goes.get((s, action))
@@ -299,13 +304,13 @@ class FaultyEngine:
                     moves[action, s] = UNKNOWN
                 else:
                     moves[action, s, target] = 0.0
-        wrong = np.where(np.array(shows)[None, :] == np.arange(max(self._seen) + 1)[:, None], 0.0, misread)
-        spent = wrong[self._seen[0]].copy()
+        wrong = np.where(np.array(shows)[None, :] == np.arange(max(self._seen) + 1)[:, None], 0.0, 1.0)
+        spent = wrong[self._seen[0]] * misread[0]
         came = np.zeros((self.size, count), dtype=np.int32)
         for t in range(1, self.size):
             ways = spent[:, None] + moves[self._actions[t - 1]]
             came[t] = ways.argmin(axis=0)
-            spent = ways[came[t], np.arange(count)] + wrong[self._seen[t]]
+            spent = ways[came[t], np.arange(count)] + wrong[self._seen[t]] * misread[t]
         labels = [int(spent.argmin())]
         for t in range(self.size - 1, 0, -1):
             labels.append(int(came[t, labels[-1]]))
@@ -321,4 +326,4 @@ class FaultyEngine:
         shown = shows or [view_of[name] for name in number]
         misread = [t for t in range(self.size) if shown[labels[t]] != self._seen[t]]
         faults = [*((t, "misread") for t in misread), *((t, "slipped") for t in slips)]
-        return Found.of(facts.faulty_map(labels, self._task.trace, faults), self._task.theory)
+        return Found.of(facts.faulty_map(labels, self._task.trace, faults, self._task.theory), self._task.theory)

@@ -523,6 +523,7 @@ def _faults_are_allowed(m: _Reading) -> Found:
     for fault in m.map.faults:
         i, kind = fault.step, fault.kind
         allowed = {"misread": m.theory.misread, "misseen": m.theory.misread, "slipped": m.theory.slipped}.get(kind, 0)
+        steps = m.trace.steps
         if not allowed or (kind == "misseen" and m.theory.star not in ("pattern", "frame")):
             yield [], f"The map disbelieves step {i} ({kind}), which the theory does not allow."
         elif not 0 <= i < min(len(m.trace), len(m.map.labels)) or (kind == "slipped" and m.trace.steps[i].action is None):
@@ -535,6 +536,8 @@ def _faults_are_allowed(m: _Reading) -> Found:
                 yield [i], f"The map says that {fault}, but the trace has {seen!r} there, and the dstate {s.view if s else None!r}."
         elif kind == "slipped" and fault.seen != (m.trace.steps[i].action or Action("")).name:
             yield [i], f"The map says that {fault}, but the trace has another action there."
+        if allowed and 0 <= i < len(steps) and round(10 * fault.cost) != (price := m.theory.fault_tenths(kind, steps[i])):
+            yield [i], f"The fault of step {i} ({kind}) costs {fault.cost:g} dstates in the map, and {price / 10:g} by the theory."
         named.add((kind, i))
 
 

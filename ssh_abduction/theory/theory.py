@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
@@ -53,6 +54,8 @@ EXCUSED = {
         "turn_rotates",
     },
 }
+# A step of little confidence costs so many times the price, and one that is all sure so many times: no view is so sure that nothing else could be wrong instead.
+LEAST_SURE, MOST_SURE = 0.1, 5.0
 DEAREST = 1000.0  # a fault costs so many dstates at most
 # So many returns, at most, may be tested together.
 MOST_JOINT = 2
@@ -253,6 +256,20 @@ class Theory:
     def has_faults(self) -> bool:
         """Whether a map may disbelieve what the trace says of some steps."""
         return self.misread > 0 or self.slipped > 0
+
+    def fault_tenths(self, kind: str, step: Step) -> int:
+        """What it costs to disbelieve a step, in tenths of dstates; 0 where the theory allows no such fault.
+
+        What is seen costs less where the step's confidence is small, as log odds: that of 0.99, which is also that of a step without one, costs the whole price.
+
+        kind  misread (the view), misseen (the star), or slipped (the action done there)
+        """
+        price = 10 * (self.slipped if kind == "slipped" else self.misread)
+        if not price or kind == "slipped" or step.confidence is None:
+            return round(price)
+        c = min(step.confidence, 1 - 1e-12)
+        odds = math.log(c / (1 - c)) / math.log(99) if c > 0 else 0.0
+        return max(1, round(price * min(max(odds, LEAST_SURE), MOST_SURE)))
 
     @cached_property
     def axioms(self) -> tuple[str, ...]:
