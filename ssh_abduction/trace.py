@@ -90,6 +90,16 @@ class Action:
             )
         return turn
 
+    @staticmethod
+    def that_slipped(step: int) -> Action:
+        """What stands for the action of a step that did not do what its name says: nothing is known of it, and it is like no other action."""
+        return Action(f"slipped at step {step}", extra={"slipped": True})
+
+    @property
+    def slipped(self) -> bool:
+        """Whether this stands for an action that did not do what its name says."""
+        return self.kind is None and self.extra.get("slipped") is True
+
     @property
     def in_quarters(self) -> bool:
         """Whether all that is said of a turn is that it goes right, left or around, by quarters."""

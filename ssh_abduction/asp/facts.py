@@ -63,7 +63,7 @@ def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
     """The most paths that a map of the first steps can have: a path begins at the start, or where a turn right or left ends."""
     if TRAVELS_AND_TURNS & theory.given_up:
         return steps
-    return 1 + sum(action.turn in ("right", "left") for action in trace.actions[: steps - 1])
+    return 1 + sum(action.turn in ("right", "left") or action.slipped for action in trace.actions[: steps - 1])
 
 
 def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
@@ -77,6 +77,7 @@ def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
             facts += [f"open({t},{slot})." for slot, is_open in enumerate(step.openings or ()) if is_open]
     done = {t: trace.actions[t] for t in range(max(start - 1, 0), stop - 1)}
     facts += [f"act({t},{_constant(action.name)})." for t, action in done.items()]
+    facts += [f"unlinked({t})." for t, action in done.items() if action.slipped]
     if theory.misread:
         facts += [f"price(misread,{t},{theory.fault_tenths('misread', trace.steps[t])})." for t in range(start, stop)]
     if theory.slipped:
@@ -637,8 +638,9 @@ def paths_framed_facts(trace: Trace, theory: Theory, chart: FramedChart, forbidd
 
     forbidden  sets of equalities of steps that do not all hold
     """
+    slipped = {chart.node_of[t] for t, action in enumerate(trace.actions[: len(chart.node_of) - 1]) if action.slipped}
     facts = [f"rotated({s},{x},{-action})." for s, action, x in chart.links if action < 0]
-    facts += [f"travelled({s},{x})." for s, _, x in chart.travels]
+    facts += [f"travelled({s},{x})." for s, _, x in chart.travels if s not in slipped]
     facts += [f"turned({s},{turn},{x})." for s, turn, x in chart.turns(trace)]
     facts += [f"excluded({s},{x})." for s, x in chart.excluded]
     visits = {(chart.facing[s][0], chart.facing[x][0]): (s, x) for s, x in chart.away}
@@ -660,7 +662,7 @@ def sides_framed_facts(theory: Theory) -> str:
 
 def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
     """Which numbered actions are travels and turns, and which axioms of sides hold, as facts for sides_frameless.lp."""
-    kinds = [f"turns({a},{action.turn})." if action.turn else f"travels({a})." for a, action in actions.items()]
+    kinds = [f"turns({a},{action.turn})." if action.turn else f"travels({a})." for a, action in actions.items() if action.kind]
     return "\n".join([*kinds, sides_framed_facts(theory)])
 
 
@@ -681,7 +683,8 @@ def paths_frameless_facts(
     facts = [sides_framed_facts(theory), *(["total."] if theory.path_order == "total" else []), *(["single."] if single else [])]
     facts += [f"is({x})." for x in dstates]
     facts += [f"far({x},{y})." for x, y in far]
-    facts += [f"turn({s},{turn},{x})." if (turn := actions[a].turn) else f"travel({s},{x})." for s, a, x in links]
+    done = [(s, actions[a], x) for s, a, x in links]
+    facts += [f"turn({s},{action.turn},{x})." if action.turn else f"travel({s},{x})." for s, action, x in done if action.kind]
     return "\n".join([*facts, *_preferred(theory)])
 
 

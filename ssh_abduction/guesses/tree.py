@@ -139,6 +139,8 @@ class Sketch:
         """Where an action leads that was never tried in a dstate."""
         if self._theory.level == "causal":
             return self._new(step, 0, 0)
+        if action.slipped:
+            return self._new_place(step)
         if action.kind == "travel":
             return self._travel(here, step)
         return self._turn(here, action, step)

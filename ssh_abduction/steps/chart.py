@@ -125,7 +125,7 @@ class Chart:
         travels: list[tuple[int, int, int]] = []
         visit = slot = 0
         for t in range(size):
-            if t and (action := trace.actions[t - 1]).kind == "travel":
+            if t and (action := trace.actions[t - 1]).kind != "turn":  # a travel, or nothing is known of where it led
                 visit, slot = visit + 1, 0
             elif t:
                 slot = (slot + QUARTERS[action.turn]) % 4
@@ -138,7 +138,7 @@ class Chart:
             if seen[here] != log.seen[t] or stars[visit] != star:
                 return None
             node_of.append(here)
-            if t and action.kind == "travel":
+            if t and action.kind != "turn":
                 travels.append((node_of[-2], log.actions[t - 1], here))
         rotations = [
             (s, -((k - j) % 4), x) for (v, j), s in node.items() for k in range(4) if k != j and (x := node.get((v, k))) is not None
@@ -168,7 +168,7 @@ class FramedChart(Chart):
 
     facing     the visit and the slot of each node; a slot counts quarters clockwise from how the robot faced as it arrived
     stars      what is open at each visit, by slot; or what is seen there, by slot
-    travels    the links that are travels, in order: travel V leads from visit V to visit V + 1
+    travels    the links that are travels, in order: travel V leads from visit V to visit V + 1. An action that slipped stands among them, as one that is done once
     elsewhere  pairs of nodes known to be at different places
     away       those of these pairs that evidence names
     """

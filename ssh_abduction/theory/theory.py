@@ -355,7 +355,7 @@ class Theory:
         """Raises TraceError, which says where, if a step lacks what the axioms need. Star has to be settled."""
         if step.view is None:
             raise TraceError(f"{where}: view: expected one, got only an image; cluster the images into views first (ssh-abduction cluster)")
-        if self.level == "topological" and step.action is not None and step.action.kind is None:
+        if self.level == "topological" and step.action is not None and step.action.kind is None and not step.action.slipped:
             raise TraceError(
                 f'{where}: action.kind: expected "travel" or "turn" in a topological theory, got none for {brief(step.action.name)}; '
                 f'write {{"name": …, "kind": "travel"}} or {{"name": …, "kind": "turn", "turn": "right"}}, or take {CAUSAL}'

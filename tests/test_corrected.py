@@ -1,0 +1,50 @@
+"""Actions of which nothing is known, and maps with faults found by mending the trace: against the plain encodings and the brute force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from unittest.mock import patch
+
+import pytest
+from brute_force import key, minimal_maps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import STARS
+
+from ssh_abduction import Search, Speedups, Theory, Trace
+from ssh_abduction.judge.checker import check
+from ssh_abduction.solver import search
+from ssh_abduction.theory.speedups import SPEEDUPS
+from ssh_abduction.trace import Action
+
+PLAIN = Speedups.without(SPEEDUPS)
+
+
+@st.composite
+def broken_traces(draw: st.DrawFn, most_steps: int = 6) -> Trace:
+    """Traces some of whose actions slipped: what stands there is no action that is known."""
+    steps = draw(st.integers(2, most_steps))
+    names = draw(st.lists(st.sampled_from(["travel", "travel", "right", "around"]), min_size=steps - 1, max_size=steps - 1))
+    slipped = draw(st.sets(st.integers(0, steps - 2), min_size=1, max_size=2))
+    actions = [Action.that_slipped(t) if t in slipped else name for t, name in enumerate(names)]
+    seen = draw(st.lists(st.sampled_from("ab"), min_size=steps, max_size=steps))
+    stars = draw(st.sampled_from([None, [STARS[0]] * steps, [(1, 1, 1, 1)] * steps]))
+    return Trace.from_steps(seen, actions, stars=stars)
+
+
+def maps_of(trace: Trace, theory: Theory, speedups: Speedups) -> set[object]:
+    with patch.object(search, "FEW_STEPS", 0):
+        found = Search(trace, theory, maps=0, speedups=speedups)
+        maps = list(found)
+    assert found.complete
+    assert all(check(trace, ssh_map, theory) == () for ssh_map in maps)
+    return {key(ssh_map) for ssh_map in maps}
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(broken_traces(), st.sampled_from(["none", "strict"]), st.booleans())
+def test_nothing_is_known_of_where_an_action_led_that_slipped(trace: Trace, boundary: str, framed: bool) -> None:
+    theory = Theory(boundary=boundary, star="frame" if framed and trace.has_stars else "none")  # type: ignore[arg-type]
+    counts, expected = minimal_maps(trace, theory)
+    assert maps_of(trace, theory, PLAIN) == set(expected)
+    assert maps_of(trace, theory, Speedups()) == set(expected)
