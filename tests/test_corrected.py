@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from unittest.mock import patch
 
-import pytest
 from brute_force import key, minimal_maps
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,7 +11,7 @@ from strategies import STARS
 
 from ssh_abduction import Search, Speedups, Theory, Trace
 from ssh_abduction.judge.checker import check
-from ssh_abduction.solver import search
+from ssh_abduction.solver import mending, search
 from ssh_abduction.theory.speedups import SPEEDUPS
 from ssh_abduction.trace import Action
 
@@ -45,6 +43,38 @@ def maps_of(trace: Trace, theory: Theory, speedups: Speedups) -> set[object]:
 @given(broken_traces(), st.sampled_from(["none", "strict"]), st.booleans())
 def test_nothing_is_known_of_where_an_action_led_that_slipped(trace: Trace, boundary: str, framed: bool) -> None:
     theory = Theory(boundary=boundary, star="frame" if framed and trace.has_stars else "none")  # type: ignore[arg-type]
-    counts, expected = minimal_maps(trace, theory)
+    _, expected = minimal_maps(trace, theory)
     assert maps_of(trace, theory, PLAIN) == set(expected)
     assert maps_of(trace, theory, Speedups()) == set(expected)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(st.data())
+def test_maps_of_mended_traces_are_those_of_the_plain_encodings(data: st.DataObject) -> None:
+    """Where all is proven: the same maps. With a star that may be misread, and actions that may slip."""
+    trace = data.draw(small_traces())
+    slipped = data.draw(st.sampled_from([0.0, 1.2]))
+    theory = Theory(
+        boundary="none", misread=data.draw(st.sampled_from([0.4, 1.5])), slipped=slipped, star="frame" if trace.has_stars else "none"
+    )
+    plain = Search(trace, theory, maps=0, speedups=PLAIN)
+    expected = {(*key(ssh_map), ssh_map.faults) for ssh_map in plain}
+    assert plain.complete
+    with patch.object(search, "FEW_STEPS", 0), patch.object(mending, "MOST_CAUSAL", 500):
+        mended = Search(trace, theory, maps=0)
+        maps = list(mended)
+    assert {(*key(ssh_map), ssh_map.faults) for ssh_map in maps} == expected
+    assert mended.complete
+    assert all(check(trace, ssh_map, theory) == () for ssh_map in maps)
+
+
+@st.composite
+def small_traces(draw: st.DrawFn) -> Trace:
+    """Out and back along a corridor, with a view or a star that may be wrong."""
+    steps = draw(st.integers(3, 6))
+    actions = draw(st.lists(st.sampled_from(["travel", "around"]), min_size=steps - 1, max_size=steps - 1))
+    seen = draw(st.lists(st.sampled_from("ab"), min_size=steps, max_size=steps))
+    if draw(st.booleans()):
+        return Trace.from_steps(seen, actions)
+    stars = draw(st.lists(st.sampled_from([(1, 0, 1, 0), (1, 0, 1, 0), (1, 1, 1, 0)]), min_size=steps, max_size=steps))
+    return Trace.from_steps(seen, actions, stars=stars)

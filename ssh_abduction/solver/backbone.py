@@ -41,6 +41,7 @@ class Rivals:
     sharing  what the known ones share
     listed   whether these are all
     engine   what they were asked of
+    reasons  whether it may be asked what those share that are not listed
     """
 
     def __init__(self, task: Task, judging: Judging) -> None:
@@ -48,6 +49,7 @@ class Rivals:
         self.sharing = Sharing()
         self.listed = False
         self.engine: Engine | None = None
+        self.reasons = True
         self._task, self._judging = task, judging
         self._cost: tuple[int, ...] = ()
         self._proven = False
@@ -67,7 +69,7 @@ class Rivals:
 
         anew  whether the limits begin anew, as the search is over
         """
-        if self.listed or self._reasoned or not self.sharing.maps:
+        if self.listed or self._reasoned or not self.reasons or not self.sharing.maps:
             return
         self._reasoned = True
         if anew:

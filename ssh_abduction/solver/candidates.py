@@ -32,7 +32,7 @@ class Candidates:
     def merge(self) -> None:
         """Make a causal map by merging steps greedily: at once, and not minimal."""
         if self._task.speedups.greedy and self._task.theory.level == "causal":
-            self._offer(facts.causal_map(self._task.log.merged(), self._task.trace))
+            self.offer(facts.causal_map(self._task.log.merged(), self._task.trace))
 
     def sketch(self) -> None:
         """Where no map of the whole trace is known yet, make some without a search: what goes on beyond the best map of a prefix, or a sketch of all steps."""
@@ -46,10 +46,10 @@ class Candidates:
             return
         for sketch in self._beyond_prefix():
             if self._goes_on_to_end(sketch):
-                self._offer(sketch.map())
+                self.offer(sketch.map())
         for sketch in Sketch.all_of(self._task.trace.steps[0], self._task.theory):
             if self._goes_on_to_end(sketch):
-                self._offer(sketch.map())
+                self.offer(sketch.map())
                 return
 
     def _beyond_prefix(self) -> Iterator[Sketch]:
@@ -75,12 +75,12 @@ class Candidates:
         try:
             for ssh_map in maps_with_frames(self._task.trace, self._task.theory, part, speedups):
                 part.shorten(seconds)
-                self._offer(ssh_map)
+                self.offer(ssh_map)
                 self._report()
         except LimitError:
             watch.check()
 
-    def _offer(self, ssh_map: SSHMap) -> None:
+    def offer(self, ssh_map: SSHMap) -> None:
         """Keep a map of the whole trace if it is better than the best one known, and satisfies all axioms."""
         found = Found.of(ssh_map, self._task.theory)
         if self._known.is_better(found) and self._judging.accepts(ssh_map):

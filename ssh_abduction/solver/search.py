@@ -50,7 +50,7 @@ from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import LimitError, StageTimeError, Stop, Watch, check_limit
 from ssh_abduction.asp.rules import check_rules
-from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Task, cost_as_counted
+from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Found, Task, cost_as_counted
 from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.errors import SolverError, TheoryError, brief
 from ssh_abduction.maps import SSHMap
@@ -74,6 +74,7 @@ FEW_STEPS = 24  # Traces up to this length skip names and greedy maps: solving t
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.
 ONE_MORE_SHARE = 0.1  # Or for such a share of the time that these took, if that is more, so that it is never a large part of the search.
 FRAME_AFTER = 1.0  # After so many seconds step by step a map with frames is sought, where the theory does not ask for one: most traces are solved by then.
+SHORTEST = 0.05  # A trace that was mended has so many seconds at least.
 REASONING = 5.0  # For so many seconds it is sought what all minimal maps share, where the search took less and has no time limit.
 ALL = Speedups()
 
@@ -163,6 +164,8 @@ class Search:
         self._basis: Basis | None = None  # of the certificate of the whole trace, where the search was stopped
         self._most = maps
         self.within = int(within)
+        self._mends = False  # whether maps were sought by mending the trace
+        self._mended_maps: tuple[SSHMap, ...] | None = None  # the minimal maps, where these were found by mending the trace
         self._near: NearMinimal | None = None  # what lists maps that cost more than the least, once these are listed
         self._levels: list[Level] = []
         self._reasons = reasons
@@ -190,10 +193,10 @@ class Search:
             from ssh_abduction.engines.faulty import FaultyEngine
             from ssh_abduction.engines.framed import FramedEngine
 
-            if self.theory.has_faults:
+            if self.theory.has_faults and self.theory.level == "causal":
                 return FaultyEngine(self._task)
-
-            return CausalEngine(self._task) if self.theory.level == "causal" else FramedEngine(self._task)
+            if not self.theory.has_faults:
+                return CausalEngine(self._task) if self.theory.level == "causal" else FramedEngine(self._task)
         most = facts.most_paths(self.trace, self.theory, len(self.trace))
         return StepEngine(self._task, min(prefixes.FIRST_PATHS, most) if self._task.speedups.path_names else most)
 
@@ -330,6 +333,8 @@ class Search:
     def _find_minimum(self) -> None:
         """Find the minimal cost; where that takes long, seek maps with frames first, and go on with an engine that settles dstates first."""
         engine, steps = self._prefixes.engine, len(self.trace)
+        if row("mending").holds_for(self.theory) and self._may_name() and self._mend():
+            return
         if self.status is Status.OPTIMAL:  # a map that another search proved
             if not engine.size:
                 engine.grow(steps if engine.lists_least else min(steps, prefixes.FIRST_PREFIX))
@@ -345,6 +350,48 @@ class Search:
                 self._settle_dstates_first()
         if self.status is Status.UNKNOWN:
             self._prefixes.find_minimum()
+
+    def _mend(self) -> bool:
+        """Where faults are allowed and there are places: find maps by mending the trace, and say whether all minimal ones are known."""
+        from ssh_abduction.solver.mending import Mending  # loads numpy
+
+        self._mends = True
+        mending = Mending(self._task, self._solve_mended)
+        self._watch.use_reserve()
+        try:
+            for found in mending.maps():
+                self._candidates.offer(found.map)
+                self._known.raise_bound(mending.bound)
+                self._report()
+            self._mended_maps = mending.minimal_maps(self._most and self._most + 1)
+        finally:
+            self._known.raise_bound(mending.bound)
+            mending.settle()
+        if self._mended_maps:
+            self._known.status = Status.OPTIMAL
+            self._known.keep(Found.of(self._mended_maps[0], self.theory), self._mended_maps[0].labels)
+            self._rivals.reasons = False  # its engines know nothing of mended traces
+        return bool(self._mended_maps)
+
+    def _solve_mended(self, mended: Trace, theory: Theory, most: int, seconds: float) -> tuple[tuple[SSHMap, ...], bool]:
+        """The minimal maps of a mended trace, so many at most, and True; or the best one known after so many seconds, and False."""
+
+        def end_with_this_search(_: Progress) -> None:
+            self._watch.check()
+
+        search = Search(
+            mended,
+            theory,
+            limit=None if seconds == math.inf else max(seconds, SHORTEST),
+            maps=most,
+            memory=self.memory,
+            speedups=self._asked_speedups,
+            on_progress=end_with_this_search,
+        )
+        maps = tuple(search.unranked())
+        if search.stopped == "interrupted":
+            self.interrupt()
+        return maps, search.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
 
     def _find_minimum_soon(self) -> bool:
         """Find the minimal cost step by step, if that is done soon."""
@@ -392,7 +439,8 @@ class Search:
 
     def _maps_by_cost(self) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
         """The minimal maps, and behind them those that cost up to `within` more, each with its preferred counts."""
-        yield from ((ssh_map, self._known.cost) for ssh_map in self._prefixes.minimal_maps())
+        minimal = self._mended_maps or self._prefixes.minimal_maps()
+        yield from ((ssh_map, self._known.cost) for ssh_map in minimal)
         self._rivals.listed = True  # so no time is kept for reasoning
         if not self._most or self.count < self._most:
             self._watch.end_stage_after(math.inf)
@@ -419,7 +467,7 @@ class Search:
         """Where the search was stopped: some map of the whole trace, if there was none, and a bound that takes no search."""
         if not self.stopped or self.status is Status.OPTIMAL:
             return
-        if self.best is None and self.stopped == "time limit" and self._watch.has_reserve:
+        if self.best is None and self.stopped == "time limit" and self._watch.has_reserve and not self._mends:
             self._salvage()
         self._candidates.sketch()
         self._count_apart()

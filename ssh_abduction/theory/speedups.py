@@ -224,6 +224,14 @@ TABLE = (
         ),
     ),
     Speedup(
+        "mending",
+        "names",
+        "Places and faults: guess the faults, mend the trace, and solve it without faults; causal maps with faults say what is minimal.",
+        lambda theory: theory.level == "topological" and theory.has_faults and not theory.without,
+        NOTHING,
+        lambda: SURVIVE_A_CUT | {f"{axiom}, excusable" for axiom in SURVIVE_A_CUT} | {"the field misread", "the field slipped"},
+    ),
+    Speedup(
         "visits",
         "names",
         "Places with frames: settle dstates, as visits that are one, before places and paths.",

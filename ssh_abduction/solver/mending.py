@@ -1,0 +1,190 @@
+"""Maps with faults in theories that have places: faults are guessed and mended in the trace, and the mended trace is solved as if nothing had been wrong.
+
+To disbelieve a view is to believe another one, and to disbelieve an action is to know nothing of it. So a map with faults is a map without them of a mended trace, which
+all fast engines take. Where faults may be is guessed twice: by robust merging of visits (`guesses/mending.py`), where places have frames, and by the causal theory with
+faults (`engines/faulty.py`), whose maps any map with places is one of, places aside.
+
+*Bound.* A map of the theory, its places taken away, is a causal map with the same dstates, and with no more faults: so what is proven of the causal theory holds here.
+Where the mended trace has a map that costs no more, its dstates and faults are minimal. And where all cheapest causal maps are listed, each minimal map of the theory has
+the labels and faults of one of them: so it is among the minimal maps of the traces that these mend, and the best of all of them are the answer, and all of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from ssh_abduction.asp import facts
+from ssh_abduction.engines.base import Found, Task
+from ssh_abduction.engines.faulty import FaultyEngine
+from ssh_abduction.engines.framed import FramedEngine
+from ssh_abduction.guesses.mending import Merging
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.theory.speedups import row
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Action, Step, Trace, View
+
+# So many causal maps that cost the least are mended at most: where there are more, the list of minimal maps is not known to be complete.
+MOST_CAUSAL = 200
+# The rounds of robust merging that begin with the last map, while that gets better.
+ROUNDS = 5
+# For so many seconds a better map is sought of what merging mends, and for such a share of the time that is left at most.
+MERGED, SHARE = 30.0, 0.5
+
+# Solves a mended trace by a theory without faults, and lists so many maps at most (0: all): its minimal maps, and True; or the best one known, and False.
+# The last argument are the seconds that it may take.
+Solver = Callable[[Trace, Theory, int, float], tuple[tuple[SSHMap, ...], bool]]
+
+
+class Mending:
+    """Finds maps with faults of a trace."""
+
+    def __init__(self, task: Task, solver: Solver) -> None:
+        self._task, self._solver = task, solver
+        self._without_faults = task.theory.replace(misread=0, slipped=0)
+        self._solved: dict[
+            Trace, tuple[Found | None, bool]
+        ] = {}  # a minimal map of each mended trace, and whether it is known to be minimal
+        self._best: Found | None = None
+        causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
+        # The log is that of the theory: so stars tell dstates apart, and so do pairs of steps that are not at one place.
+        self._causal = FaultyEngine(replace(Task.of(task.trace, causal, task.watch), log=task.log))
+
+    @property
+    def bound(self) -> int | None:
+        """Tenths of dstates that a map costs at least, as far as the causal theory shows; None before anything is known."""
+        return self._causal.bound
+
+    def settle(self) -> None:
+        """End what is still under way in clingo."""
+        self._causal.settle()
+
+    def maps(self) -> Iterator[Found]:
+        """Maps of the whole trace, each better than the one before."""
+        yield from self._by_merging()
+        for mended in self._by_causal_maps():
+            yield from self._improving(self._minimal(mended)[0])
+
+    def minimal_maps(self, most: int) -> tuple[SSHMap, ...] | None:
+        """The minimal maps, once the causal theory shows that none is cheaper than the best one; None where it does not, or where some may be missing.
+
+        most  list so many of each mended trace at most; 0 for all
+        """
+        if self._best is None or self.bound is None or self._best.cost[0] > self.bound:
+            return None
+        causal = list(self._causal.maps_of_cost((self.bound,), MOST_CAUSAL))
+        if len(causal) == MOST_CAUSAL:
+            return None
+        solved = {mended: self._minimal(mended) for mended in dict.fromkeys(self._mended(found.map) for found in causal)}
+        if not all(proven for _, proven in solved.values()):
+            return None
+        costs = {mended: found.cost for mended, (found, _) in solved.items() if found is not None}
+        least = min(costs.values())
+        minimal = [mended for mended, cost in costs.items() if cost == least]
+        listed = (self._as_found(ssh_map, mended).map for mended in minimal for ssh_map in self._maps_of(mended, most)[0])
+        return tuple(dict.fromkeys(listed))
+
+    def _improving(self, better: Found | None) -> Iterator[Found]:
+        """A map, if it is better than the best one so far."""
+        if better is not None and (self._best is None or better.cost < self._best.cost):
+            self._best = better
+            yield better
+
+    def _by_merging(self) -> Iterator[Found]:
+        """Maps of what robust merging mends; then once more from the places of the best map, while that gets better.
+
+        The merged groups are nearly a map, which is there at once; what is better is sought for a share of the time.
+        """
+        theory = self._task.theory
+        if theory.star != "frame" or not theory.misread:
+            return
+        before: Found | None = None
+        for _ in range(ROUNDS):
+            merging = Merging(self._task.trace, theory, self._task.log.pairs, self._task.watch.check)
+            if before is not None:
+                merging.start_from(_places(before.map))
+            merging.merge()
+            mended = merging.mended()
+            task = Task.of(mended, self._without_faults, self._task.watch, self._task.speedups)
+            near = FramedEngine(task).map_mended_from(merging.labels()) if _has_frames(task) else None
+            if near is not None:
+                yield from self._improving(self._as_found(near.map, mended))
+            yield from self._improving(self._minimal(mended, MERGED)[0])
+            if self._best is before:
+                return
+            before = self._best
+
+    def _by_causal_maps(self) -> Iterator[Trace]:
+        """What causal maps mend, each cheaper than the one before."""
+        self._causal.grow(len(self._task.trace))
+        for found in self._causal.improving_maps():
+            yield self._mended(found.map)
+
+    def _mended(self, causal: SSHMap) -> Trace:
+        """The trace with what a causal map disbelieves replaced: by what was seen at another step at the same dstate, or by an action of which nothing is known."""
+        wrong = {kind: {fault.step for fault in causal.faults if fault.kind == kind} for kind in ("misread", "slipped")}
+        steps = list(self._task.trace.steps)
+        right: dict[int, Step] = {}
+        for t, label in enumerate(causal.labels):
+            if t not in wrong["misread"]:
+                right.setdefault(label, steps[t])
+        for t in wrong["misread"]:
+            seen = right[causal.labels[t]]
+            star = seen.star if self._task.theory.star in ("pattern", "frame") else steps[t].star
+            steps[t] = replace(steps[t], view=seen.view, star=star)
+        for t in wrong["slipped"]:
+            steps[t] = replace(steps[t], action=Action.that_slipped(t))
+        return replace(self._task.trace, steps=tuple(steps))
+
+    def _minimal(self, mended: Trace, seconds: float = math.inf) -> tuple[Found | None, bool]:
+        """A minimal map of a mended trace, as one of the trace itself, and whether it is known to be minimal. None where it has no map, or none was found in time.
+
+        seconds  that it is sought at most
+        """
+        if mended not in self._solved or not self._solved[mended][1]:
+            maps, proven = self._maps_of(mended, 1, seconds)
+            self._solved[mended] = self._as_found(maps[0], mended) if maps else None, proven
+        return self._solved[mended]
+
+    def _maps_of(self, mended: Trace, most: int, seconds: float = math.inf) -> tuple[list[SSHMap], bool]:
+        """Minimal maps of a mended trace, and whether they are known to be minimal."""
+        maps, proven = self._solver(mended, self._without_faults, most, min(seconds, SHARE * self._task.watch.left()))
+        return list(maps), proven
+
+    def _as_found(self, ssh_map: SSHMap, mended: Trace) -> Found:
+        """A map of a mended trace as one of the trace itself."""
+        return Found.of(with_faults(ssh_map, self._task.trace, mended, self._task.theory), self._task.theory)
+
+
+def _has_frames(task: Task) -> bool:
+    """Whether the fast engine for frames is exact here."""
+    return row("visits").holds_for(task.theory)
+
+
+def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
+    """The place of each step, and the slot of the place that it faces."""
+    at = [None if s.place is None or s.heading is None else (s.place, s.heading) for s in ssh_map.dstates]
+    return [at[label] for label in ssh_map.labels]
+
+
+def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) -> SSHMap:
+    """A map of a mended trace as a map of the trace, with what was mended as its faults. Each dstate has the view that most of its steps show."""
+    votes: dict[int, Counter[View | None]] = {}
+    for label, step in zip(ssh_map.labels, trace.steps, strict=True):
+        votes.setdefault(label, Counter())[step.view] += theory.fault_tenths("misread", step) or 1
+    shows = {label: max(counts, key=lambda view: counts[view]) for label, counts in votes.items()}
+    faults: list[tuple[int, str]] = []
+    for t, (step, other) in enumerate(zip(trace.steps, mended.steps, strict=True)):
+        if step.view != shows[ssh_map.labels[t]]:
+            faults.append((t, "misread"))
+        if theory.star in ("pattern", "frame") and step.openings != other.openings:
+            faults.append((t, "misseen"))
+        if step.action != other.action:
+            faults.append((t, "slipped"))
+    labels = dict(enumerate(ssh_map.labels))
+    views = facts.views_of(labels, trace, faults)
+    dstates = tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates)
+    links = facts.links_of(ssh_map.labels, trace, faults)
+    return replace(ssh_map, dstates=dstates, links=links, faults=facts.faults_of(faults, labels, views, trace, theory))
