@@ -59,7 +59,9 @@ def main() -> None:
                 if not is_refused(walk, reject):  # a smaller share refuses less
                     break
                 refused[line, column] += 1
-    print(f"| `reject` | white noise only | with {100 * MODEL.scale:g} % scale and {np.degrees(MODEL.bend):.1g} degrees a metre |\n|---|---|---|")
+    print(
+        f"| `reject` | white noise only | with {100 * MODEL.scale:g} % scale and {np.degrees(MODEL.bend):.1g} degrees a metre |\n|---|---|---|"
+    )
     for reject, counts in zip(REJECTS, refused / options.routes, strict=True):
         print(f"| {reject:g} | {counts[0]:.3f} | {counts[1]:.3f} |")
 
