@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.sparse.linalg import lsqr, splu
 from scipy.special import gammaincc
 
@@ -38,6 +38,8 @@ Array: TypeAlias = NDArray[np.float64]
 
 # With a standard deviation below this, in metres or radians, a displacement counts as exact.
 EXACT = 2e-3
+# The power method takes so many sweeps, and holds each rotation with so much weight to where it was: little, as a metre is worth some hundreds.
+SWEEPS, HELD = 20, 1e-2
 
 
 def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
@@ -71,6 +73,8 @@ class _Problem:
         self._place = np.array([number[place] for place in places], dtype=int)
         self._positions, self._headings = len(number), len(places)
         self._size = 2 * self._positions + self._headings + 2
+        # The group of each dstate: displacements connect the headings of one group, and of one part of the map the positions.
+        self._group = connected_components(self._graph(self._from, self._to, self._headings), directed=False)[1]
 
     def solved(self) -> Fit:
         unknown = self._begun()
@@ -88,29 +92,69 @@ class _Problem:
         unknown = np.zeros(self._size)
         at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
         # Headings first, which are linear but for whole turns, and then positions, which are linear where headings are known (Carlone et al. 2014).
-        reckoned = self._headings_by_first_visit()
+        reckoned = self._reckoned()
         off = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
         off -= math.tau * np.round(off / math.tau)
         heading[:] = reckoned + _least(self._differences(self._from, self._to, self._headings), off / self._sigmas(2), 1 / self._sigmas(2))
+        weights, differences = 1 / self._sigmas(0), self._moves()
+        if self._group.max() > 0:
+            heading += self._rotations(turned(self._moved[:, :2], heading[self._from]))[self._group]
         onward = turned(self._moved[:, :2], heading[self._from])
-        differences = self._differences(self._place[self._from], self._place[self._to], self._positions)
-        weights = 1 / self._sigmas(0)
         for axis in range(2):
             at[:, axis] = _least(differences, onward[:, axis] * weights, weights)
         return unknown
 
-    def _headings_by_first_visit(self) -> Array:
-        """For each dstate, the heading by dead reckoning when it was first visited."""
+    def _reckoned(self) -> Array:
+        """For each dstate, the heading as seen from one of its group, by the fewest displacements between."""
         heading = np.zeros(self._headings)
-        known: dict[int, float] = {}
-        here, last = 0.0, None
-        for s, x, rotated in zip(self._from.tolist(), self._to.tolist(), self._moved[:, 2].tolist(), strict=True):
-            here = known.setdefault(s, here if last == s else 0.0)
-            here, last = here + rotated, x
-            here = known.setdefault(x, here)
-        for s, angle in known.items():
-            heading[s] = angle
+        rotated: dict[tuple[int, int], float] = {}
+        for s, x, angle in zip(self._from.tolist(), self._to.tolist(), self._moved[:, 2].tolist(), strict=True):
+            rotated[x, s], rotated[s, x] = -angle, angle
+        graph = self._graph(self._from, self._to, self._headings)
+        for first in np.unique(self._group, return_index=True)[1].tolist():
+            order, before = breadth_first_order(graph, first, directed=False)
+            for x, s in zip(order[1:].tolist(), before[order[1:]].tolist(), strict=True):
+                heading[x] = heading[s] + rotated[s, x]
         return heading
+
+    def _rotations(self, onward: Array) -> Array:
+        """By how much the headings of each group are to be turned, in radians, so that positions agree.
+
+        What is least is a quadratic form of the rotations, as complex numbers on the unit circle. They are sought by the power method for its inverse, from
+        anywhere (Boumal 2016, "Nonconvex phase synchronization"). What positions do not tell stays as it begins.
+
+        onward  the displacements, as headings are now
+        """
+        size = int(self._group.max()) + 1
+        inverse = np.linalg.inv(self._misfit(onward) + HELD * np.identity(size))
+        rotation: NDArray[np.complex128] = np.exp(1j * np.random.default_rng(0).uniform(-math.pi, math.pi, size))
+        for _ in range(SWEEPS):
+            rotation = inverse @ rotation
+            rotation /= np.maximum(abs(rotation), 1e-300)
+        angles: Array = np.angle(rotation)
+        return angles
+
+    def _misfit(self, onward: Array) -> NDArray[np.complex128]:
+        """The least sum of squares that positions can come to, as a quadratic form of the rotation of each group; vectors are complex numbers.
+
+        onward  the displacements, as headings are without these rotations
+        """
+        weights = 1 / self._sigmas(0)
+        vectors = weights * (onward[:, 0] + 1j * onward[:, 1])
+        columns = np.arange(len(vectors)), self._group[self._from]
+        turns = coo_array((vectors, columns), shape=(len(vectors), int(self._group.max()) + 1)).tocsr()
+        moves = csr_array(self._moves().multiply(weights[:, None]))
+        mixed = (moves.T @ turns).toarray()
+        solved = splu(((moves.T @ moves) + 1e-9 * _identity(self._positions)).tocsc().astype(complex)).solve(mixed)
+        form: NDArray[np.complex128] = (turns.conj().T @ turns).toarray() - mixed.conj().T @ solved
+        return form
+
+    def _moves(self) -> csr_array:
+        """The matrix that makes, of positions, how far each displacement leads."""
+        return self._differences(self._place[self._from], self._place[self._to], self._positions)
+
+    def _graph(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
+        return coo_array((np.ones(len(first)), (first, second)), shape=(size, size)).tocsr()
 
     def _sigmas(self, axis: int) -> Array:
         """The standard deviation of each displacement along an axis, about."""
@@ -173,13 +217,14 @@ class _Problem:
 
     def _parts(self) -> NDArray[np.int_]:
         """The part of the map that each position is in: displacements do not connect one part with another."""
-        ends = self._place[self._from], self._place[self._to]
-        graph = coo_array((np.ones(len(ends[0])), ends), shape=(self._positions, self._positions))
-        part: NDArray[np.int_] = connected_components(graph, directed=False)[1]
+        part: NDArray[np.int_] = connected_components(
+            self._graph(self._place[self._from], self._place[self._to], self._positions), directed=False
+        )[1]
         return part
 
     def _freedom(self, unknown: Array) -> int:
-        """The degrees of freedom: what displacements say, without what the poses take up. Each part of the map may be moved and turned as a whole.
+        """The degrees of freedom: what displacements say, without what the poses take up. Each part of the map may be moved as a whole, and turned, as may each group of
+        headings in it that positions leave open.
 
         What is known to the millimetre has no noise that would count: it settles as many unknowns as it is about, and says no more.
         """
@@ -188,7 +233,19 @@ class _Problem:
         parts = len(np.unique(self._parts()[used]))
         exact = (1 / np.sqrt((self._whitening**2).sum(1)) < EXACT).ravel()
         settled = int(np.linalg.matrix_rank(self._jacobian(unknown)[: len(exact)][exact].toarray())) if exact.any() else 0
-        return int(len(exact) - exact.sum() - (2 * len(used) + len(said) - 3 * parts - settled))
+        return int(len(exact) - exact.sum() - (2 * len(used) + len(said) - 2 * parts - self._open_rotations(unknown, said) - settled))
+
+    def _open_rotations(self, unknown: Array, said: NDArray[np.int_]) -> int:
+        """In how many ways groups of headings can be turned while all displacements stay what they are.
+
+        said  the dstates that displacements are about
+        """
+        groups = np.unique(self._group[said])
+        if len(groups) == len(np.unique(self._parts()[self._place[said]])):
+            return len(groups)
+        at = unknown[: 2 * self._positions].reshape(-1, 2)
+        form = self._misfit(at[self._place[self._to]] - at[self._place[self._from]]).real[groups][:, groups]
+        return int((np.linalg.eigvalsh(form) < 1e-6 * max(float(form.diagonal().max()), 1.0)).sum())
 
     def _poses(self, unknown: Array) -> tuple[Pose, ...]:
         """The poses, each part of the map seen from the first dstate there; and how uncertain the positions are as seen from it."""

@@ -62,8 +62,8 @@ def rungs(trace: Trace, theory: Theory) -> Iterator[tuple[str, Theory]]:
     theory = theory.replace(star="none", displacement="none", planar=False)
     yield "views", theory
     topological = theory.level == "topological"
-    if topological and trace.has_stars:
-        theory = theory.replace(star="auto")
+    if trace.has_stars:
+        theory = theory.replace(star="auto" if topological else "alike")
         yield "+ star", theory
     if trace.has_displacements:
         theory = theory.replace(displacement="use", joint=1)

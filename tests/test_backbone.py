@@ -6,7 +6,7 @@ import json
 import pickle
 import random
 from collections.abc import Callable
-from itertools import combinations_with_replacement
+from itertools import combinations, combinations_with_replacement
 from unittest.mock import patch
 
 import pytest
@@ -17,9 +17,10 @@ from strategies import TOYS, theories, traces
 from worlds import HEADINGS, QUARTERS, TWO_BLOCKS, Streets, drive, rectangle
 
 from benchmarks.instances import maze
-from ssh_abduction import OnlineMapper, Search, Status, Theory, Trace, solve
+from ssh_abduction import Odometry, OnlineMapper, Search, Status, Theory, Trace, solve
 from ssh_abduction.asp.limits import Watch
 from ssh_abduction.cli import main
+from ssh_abduction.cli.text import differences
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.engines.frameless import FramelessEngine
 from ssh_abduction.engines.stepwise import StepEngine
@@ -266,3 +267,17 @@ def test_of_many_pairs_so_many_are_printed_and_all_are_counted() -> None:
     pairs = tuple((0, t) for t in range(1, 1501))
     told = Shared((*range(1501),), pairs).to_dict([0, 1])
     assert (told["always"], len(told["sometimes"]), told["pairs"]) == ([0, 1], 1000, 1500)
+
+
+def test_maps_that_differ_in_directions_along_paths_alone_are_told_apart() -> None:
+    trace = maze(3, 3, steps=40, seed=4242, stars=True, follow=True, odometry=Odometry()).trace
+    solution = solve(trace, maps=0)
+    pairs = [(m, n) for m, n in combinations(solution.maps, 2) if [s.path for s in m.dstates] == [s.path for s in n.dstates]]
+    assert pairs
+    for one, other in pairs:
+        head, *rows = differences([one, other], trace).splitlines()
+        told = {int(row.split()[0]) for row in rows}
+        assert head.split() == ["step", "view", "map", "1", "map", "2"]
+        assert told
+        assert {row.split()[2] for row in rows} == {"direction"}
+        assert told <= {t for t, (s, x) in enumerate(zip(one.labels, other.labels, strict=True)) if one.dstates[s] != other.dstates[x]}

@@ -11,15 +11,16 @@ import pytest
 from brute_geometry import Geometry
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from instances import maze
 from scipy.optimize import approx_fprime
 from strategies import theories, traces
 from test_property import agree
 
-from ssh_abduction import Odometry, SSHMap, Theory, TheoryError, Trace, solve
+from ssh_abduction import DState, Odometry, SSHMap, Theory, TheoryError, Trace, solve
 from ssh_abduction.asp.facts import causal_map
 from ssh_abduction.fit import _Problem, fit
 from ssh_abduction.judge.checker import check
-from ssh_abduction.solver.ranking import noise_warning
+from ssh_abduction.solver.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns
 from ssh_abduction.theory.loops import Loops
@@ -186,6 +187,23 @@ def test_a_noise_model_that_is_off_is_noticed(factor: float, said: str | None) -
     assert f"multiply them by {factor:.1g}"[:-1] in warning or abs(float(warning.rsplit(" ", 1)[1]) - factor) < 0.2 * factor
 
 
+def test_kilometres_are_noticed() -> None:
+    """Ways that are lost in the noise of the odometry, as are those of wheels that report nothing; not those of a robot that is small and says so."""
+    trace = circuit(4, 9)
+
+    def scaled(by: float, **noise: float) -> Trace:
+        steps = (replace(s, displacement=s.displacement and (s.displacement[0] * by, 0.0, s.displacement[2])) for s in trace.steps)
+        return replace(trace, steps=tuple(steps), odometry=replace(WHITE, **noise))
+
+    said = "the odometry tells no travel from standing still: the longest displacement of one is 0.01 m, and its noise about 0.1 m; "
+    assert (solve(scaled(0.001)).odometry_warning or "").startswith(said)
+    assert "the longest displacement of one is 0 m" in (solve(scaled(0.0)).odometry_warning or "")
+    assert units_warning(scaled(0.001, position=0.001)) is None
+    assert units_warning(trace) is None
+    assert units_warning(trace.without_displacements()) is None
+    assert units_warning(Trace.from_steps("ab", ["right"], displacements=[(0.0, 0.0, 1.0)])) is None
+
+
 def test_the_map_that_closes_best_comes_first_and_rivals_have_weights() -> None:
     trace = circuit(4, 6, 1.0)
     theory = Theory.causal().replace(prefer=(), joint=1, reject=1e-9)
@@ -242,3 +260,28 @@ def test_maps_with_a_fit_survive_a_round_trip(tmp_path: Path) -> None:
     assert found.fit is not None
     assert again.fit.chi2 == pytest.approx(found.fit.chi2, abs=1e-5)
     assert [p.x for p in again.fit.poses] == pytest.approx([p.x for p in found.fit.poses], abs=1e-3)
+
+
+@pytest.mark.parametrize("kept", ["travels", "turns", "most", "few"])
+def test_fits_of_true_maps_are_as_likely_where_displacements_are_missing(kept: str) -> None:
+    """Of 20 true maps: where turns are not reported, headings are told by what places the stretches between them share, or not at all."""
+    squares = freedom = above = 0.0
+    for seed in range(20):
+        walk = maze(3, 3, steps=30, seed=seed, stars=True, follow=True, odometry=Odometry())
+        rng = np.random.default_rng(seed)
+        keeps = [
+            {"travels": action.kind == "travel", "turns": action.kind == "turn", "most": rng.random() < 0.8, "few": rng.random() < 0.2}[
+                kept
+            ]
+            for action in walk.trace.actions
+        ]
+        steps = (step if keep else replace(step, displacement=None) for step, keep in zip(walk.trace, [True, *keeps], strict=True))
+        number: dict[object, int] = {}
+        labels = tuple(number.setdefault(state, len(number)) for state in walk.truth)
+        places: dict[object, int] = {}
+        dstates = tuple(DState(i, "", places.setdefault(state[:2], len(places))) for i, state in enumerate(number))  # type: ignore[index]
+        found = fit(replace(walk.trace, steps=tuple(steps)), SSHMap(labels, dstates, ()))
+        assert found.p > 1e-5
+        squares, freedom, above = squares + found.chi2, freedom + found.dof, above + (found.p > 0.5)
+    assert squares == pytest.approx(freedom, rel=0.25)
+    assert 4 <= above <= 16

@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+import reject
 import truth
 from instances import CELL, maze
 
@@ -75,3 +76,14 @@ def test_the_table_says_which_maps_are_true(capsys: pytest.CaptureFixture[str]) 
     said = truth.report(truth.chosen(options), Theory.topological(), 30)
     assert said.startswith("all minimal maps are true: 1 of 1; median ")
     assert "| 22, 9, 6 | 1 of 1 |" in capsys.readouterr().out
+
+
+def test_what_is_refused_of_true_maps_is_counted() -> None:
+    """A true map is hardly ever refused, and always where its displacements are those of another route; with errors that repeat the scale is off."""
+    white, repeating = reject.walks(3, 30, 7)
+    assert (white.trace.odometry or NOISE).bend == 0 < (repeating.trace.odometry or EXACT).bend
+    assert reject.true_map(white).labels == reject.true_map(repeating).labels
+    assert not reject.is_refused(white, 0.001)
+    assert not reject.is_refused(repeating, 0.001)
+    wrong = replace(white.trace, steps=tuple(replace(step, displacement=step.displacement and (9.0, 0.0, 0.1)) for step in white.trace))
+    assert reject.is_refused(replace(white, trace=wrong), 0.001)

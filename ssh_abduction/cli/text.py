@@ -60,7 +60,7 @@ def by_displacements(solution: Solution) -> Iterator[str]:
         which = "the map closes" if solution.count == 1 else "map 1, which closes best, does so"
         text += f"; {which} with a chi-square of {best.chi2:.1f} for {best.dof} degrees of freedom (p = {best.p:.2g})"
         if best.scale or best.bend:
-            text += f", scale off by {100 * best.scale:+.1f} %, headings drift by {math.degrees(best.bend):+.3f} degrees a metre"
+            text += f", scale off by {100 * best.scale:+z.1f} %, headings drift by {math.degrees(best.bend):+z.3f} degrees a metre"
     yield text
     weights = solution.weights
     if len(weights) > 1:
@@ -125,26 +125,25 @@ def course(path: int | None, direction: int | None) -> str:
 
 
 def differences(maps: Sequence[SSHMap], trace: Trace) -> str:
-    """The steps at which the maps disagree, and on what. A dstate, place or path is named by the first step at it."""
+    """The steps at which the maps disagree, and on what. A dstate, place or path, or a path in one direction, is named by the first step at it."""
     named = [_named(ssh_map) for ssh_map in maps]
     rows: list[list[object]] = []
     for t, step in enumerate(trace.steps):
-        for i, sort in enumerate(("dstate", "place", "path")):
+        differing = False
+        for i, sort in enumerate(("dstate", "place", "path", "direction")):
             cells = [names[t][i] for names in named]
-            if len(set(cells)) > 1:
+            if len(set(cells)) > 1 and not (sort == "direction" and differing):  # along another path is along another direction of one
+                differing = sort == "path"
                 rows.append([t, step.view, sort, *("none" if c is None else "new" if c == t else f"of step {c}" for c in cells)])
     return table(["step", "view", "", *(f"map {i + 1}" for i in range(len(maps)))], rows)
 
 
-def _named(ssh_map: SSHMap) -> list[tuple[int | None, int | None, int | None]]:
-    """For each step the first steps at its dstate, at its place, and along its path."""
-    first: dict[tuple[str, int], int] = {}
-    found: list[tuple[int | None, int | None, int | None]] = []
+def _named(ssh_map: SSHMap) -> list[tuple[int | None, ...]]:
+    """For each step the first steps at its dstate, at its place, along its path, and along that in its direction."""
+    first: dict[tuple[str, object], int] = {}
+    found: list[tuple[int | None, ...]] = []
     for t, label in enumerate(ssh_map.labels):
         s = ssh_map.dstates[label]
-        dstate, place, path = (
-            None if name is None else first.setdefault((sort, name), t)
-            for sort, name in (("dstate", s.id), ("place", s.place), ("path", s.path))
-        )
-        found.append((dstate, place, path))
+        names = (("dstate", s.id), ("place", s.place), ("path", s.path), ("direction", None if s.path is None else (s.path, s.direction)))
+        found.append(tuple(None if name is None else first.setdefault((sort, name), t) for sort, name in names))
     return found

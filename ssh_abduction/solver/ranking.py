@@ -16,6 +16,8 @@ RANKED = 1000
 DOUBTED = 1e-3
 # and the standard deviations are too small by this factor at least, or too large by that one: less changes no answer, and too large ones only exclude less.
 TOO_SMALL, TOO_LARGE = 1.5, 2.0
+# A displacement of so many standard deviations may be that of a robot which stands still.
+STANDING = 2.0
 # Displacements that agree to the last digit would make it 0.
 NEVER_LESS = 0.01
 
@@ -72,6 +74,30 @@ def noise_warning(fit: Fit | None) -> str | None:
     return (
         f"the noise model of the odometry is too {told}: the best map closes with a chi-square of {fit.chi2:.0f} where {fit.dof} is expected, "
         f"so its standard deviations are {_times(factor)} {how} than the errors; multiply them by {factor:.2g}"
+    )
+
+
+def units_warning(trace: Trace) -> str | None:
+    """That displacements do not tell any travel from standing still, as where they are in kilometres; None where they do, or no travel has one."""
+    ways: list[float] = []
+    sigmas: list[float] = []
+    for action, step, t in zip(trace.actions, trace.steps[1:], range(1, len(trace)), strict=True):
+        covariance = trace.covariance(t)
+        if action.kind != "travel" or step.displacement is None or covariance is None:
+            continue
+        dx, dy, _ = step.displacement
+        way = math.hypot(dx, dy)
+        x, y = (dx / way, dy / way) if way else (1.0, 0.0)
+        sigma = math.sqrt(x * x * covariance[0][0] + 2 * x * y * covariance[0][1] + y * y * covariance[1][1])
+        if way > STANDING * sigma:
+            return None
+        ways.append(way)
+        sigmas.append(sigma)
+    if not ways:
+        return None
+    return (
+        f"the odometry tells no travel from standing still: the longest displacement of one is {max(ways):.3g} m, and its noise about {max(sigmas):.2g} m; "
+        "give metres and not kilometres, or the noise that the odometry has"
     )
 
 

@@ -103,7 +103,7 @@ class Solution:
     levels     how many minimal maps were given and, with `within`, how many that have more dstates: a level for each number of them that some map has
     rivals     what the backbone is worked out from; where there is none, it is worked out from the maps listed
     evidence   for each kind of evidence that took part: how many pairs of steps it excluded, and how many sets of equalities it refused
-    odometry_warning  what is wrong with the noise that the odometry claims, if the best map shows that
+    odometry_warning  what is wrong with the noise that the odometry claims, if the best map shows that, or that displacements tell no travel from standing still
     """
 
     status: Status

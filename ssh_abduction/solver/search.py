@@ -61,7 +61,7 @@ from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.solver.ranking import Ranking, noise_warning
+from ssh_abduction.solver.ranking import Ranking, noise_warning, units_warning
 from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solution, Status
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.steps.certificate import Basis
@@ -545,7 +545,7 @@ class Search:
             levels=tuple(self._levels),
             rivals=self._rivals,
             evidence=said_by(evidence_of(self.theory), self.trace, self._known.refused),
-            odometry_warning=noise_warning(self._first.fit if self._first else None),
+            odometry_warning=(units_warning(self.trace) or noise_warning(self._first.fit)) if self._first and self._first.fit else None,
         )
 
     def snapshot(self, stopped: Stop) -> Solution:

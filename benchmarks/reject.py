@@ -1,0 +1,70 @@
+"""How often displacements refuse a true map: routes through mazes, with the default noise of odometry, and the true map of each tested.
+
+    python benchmarks/reject.py [--routes 1000] [--cells 4] [--steps 40] [--first 0]
+
+A row for each `reject`, the chance, at most, that a true map is refused. In the first column of shares the noise is white, and the model has no errors that repeat; in the second one a scale
+and a drift of heading are drawn for each route, with the standard deviations that the model has for them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from instances import Walk, maze
+
+from ssh_abduction import DState, Odometry, SSHMap, Theory
+from ssh_abduction.judge.geometry import refused_returns
+
+REJECTS = (0.5, 0.2, 0.05, 0.01, 0.001)
+MODEL = Odometry()
+
+
+def true_map(walk: Walk) -> SSHMap:
+    """The true map of a walk, as far as displacements are about it: dstates and their places."""
+    number: dict[object, int] = {}
+    labels = tuple(number.setdefault(state, len(number)) for state in walk.truth)
+    places: dict[object, int] = {}
+    at = [places.setdefault(state[:2], len(places)) for state in number if isinstance(state, tuple)]
+    return SSHMap(labels, tuple(DState(i, "", place) for i, place in enumerate(at)), ())
+
+
+def walks(cells: int, steps: int, seed: int) -> Iterator[Walk]:
+    """The route of one seed, with white noise, and with errors that repeat."""
+    rng = np.random.default_rng(seed)
+    scale, bend = rng.normal(0.0, MODEL.scale), rng.normal(0.0, MODEL.bend)
+    white = replace(MODEL, scale=0.0, bend=0.0)
+    yield maze(cells, cells, steps=steps, seed=seed, follow=True, odometry=white)
+    yield maze(cells, cells, steps=steps, seed=seed, follow=True, odometry=MODEL, scale=scale, bend=bend)
+
+
+def is_refused(walk: Walk, reject: float) -> bool:
+    theory = Theory(displacement="use", reject=reject).resolve(walk.trace)
+    return any(refused_returns(walk.trace, true_map(walk), theory))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--routes", type=int, default=1000, metavar="N", help="routes (default 1000)")
+    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)")
+    parser.add_argument("--cells", type=int, default=4, metavar="N", help="mazes of N x N cells (default 4)")
+    parser.add_argument("--steps", type=int, default=40, metavar="N", help="actions of the robot (default 40)")
+    options = parser.parse_args()
+    refused = np.zeros((len(REJECTS), 2), dtype=int)
+    for seed in range(options.first, options.first + options.routes):
+        for column, walk in enumerate(walks(options.cells, options.steps, seed)):
+            for line, reject in enumerate(REJECTS):
+                if not is_refused(walk, reject):  # a smaller share refuses less
+                    break
+                refused[line, column] += 1
+    print(
+        f"| `reject` | white noise only | with {100 * MODEL.scale:g} % scale and {np.degrees(MODEL.bend):.1g} degrees a metre |\n|---|---|---|"
+    )
+    for reject, counts in zip(REJECTS, refused / options.routes, strict=True):
+        print(f"| {reject:g} | {counts[0]:.3f} | {counts[1]:.3f} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""The ladder: what each kind of evidence is worth, one more on each rung."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import truth
+
+from ssh_abduction import Odometry, Theory
+from ssh_abduction.cli import main
+from ssh_abduction.rungs import ladder
+
+
+def aces3() -> truth.Known:
+    (known,) = truth.aces3([3], truth.Noise(Odometry(**truth.NOISE)))
+    return known
+
+
+def test_displacements_make_the_true_map_of_aces3_the_only_minimal_one() -> None:
+    rungs = {rung.name: rung for rung in ladder(aces3().trace)}
+    assert list(rungs) == ["views", "+ star", "+ pairs", "+ geometry", "+ planarity"]
+    assert [rung.solution.cost.dstates for rung in rungs.values() if rung.solution.cost] == [19, 19, 22, 22, 22]
+    assert [rung.rank for rung in rungs.values()] == [None, None, 1, 1, 1]
+    assert [rung.solution.count for rung in rungs.values()][2:] == [1, 1, 1]
+    assert [rung.solution.theory.star for rung in rungs.values()] == ["none", *["frame"] * 4]
+
+
+def test_what_a_trace_does_not_have_is_no_rung() -> None:
+    trace = aces3().trace
+    assert [rung.name for rung in ladder(trace.without_displacements(), maps=1)] == ["views", "+ star", "+ planarity"]
+    causal = {rung.name: rung.solution.theory.star for rung in ladder(trace, Theory.causal(), maps=1)}
+    assert causal == {"views": "none", "+ star": "alike", "+ pairs": "alike", "+ geometry": "alike"}  # planarity is about places
+
+
+def test_the_shell_prints_a_row_a_rung(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "route.jsonl"
+    aces3().trace.save(path)
+    assert main(["ladder", str(path)]) == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head.split()[:2] == ["minimal", "maps"]
+    assert rows[1].split()[:7] == ["+", "star", "4", "19", "10", "4", "none"]
+    assert rows[3].split()[:8] == ["+", "geometry", "1", "22", "9", "6", "map", "1"]
+    assert main(["ladder", str(path), "--json", "--theory", "causal", "-n", "1"]) == 0
+    assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == ["views", "+ star", "+ pairs", "+ geometry"]
