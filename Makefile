@@ -1,7 +1,7 @@
 # make demo   install what the lock says into .venv, solve a real route and show the map
 # make bench  time and memory on this machine, ours and those of peers from PyPI, as a table; the better part of an hour
 # make bench-faults  the same of faults: are they found, by ours and by peers; some hours, or ARGS="--seeds 2 --limit 10"
-# make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; half an hour, or ARGS="--part growing --seeds 1"
+# make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; an hour, or ARGS="--part growing --seeds 1"
 # make parts  times of single parts: circuits, images, exploring step by step, and small traces
 # make test   the same, with the tools of development: lint, types, layers, tests
 PYTHON ?= python3

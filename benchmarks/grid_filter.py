@@ -109,7 +109,7 @@ class Grid:
     def centres(self) -> Array:
         """The middles of the free cells, (free cells, 2), in metres."""
         rows, columns = np.nonzero(self.free)
-        return np.column_stack([columns, rows]) * self.resolution + self.resolution / 2 + np.array(self.origin)
+        return np.asarray((np.column_stack([columns, rows]) + 0.5) * self.resolution + np.array(self.origin), np.float64)
 
     @cached_property
     def number(self) -> NDArray[np.int32]:
@@ -121,14 +121,14 @@ class Grid:
     @cached_property
     def angles(self) -> Array:
         """The headings, in radians."""
-        return np.arange(self.headings) * (math.tau / self.headings)
+        return np.asarray(np.arange(self.headings) * (math.tau / self.headings), np.float64)
 
     def likelihoods(self, image: Array, model: BeamModel) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
         """For the beams used their directions against the heading, in headings, (b,); and log p(range | expected) for each expected range in units of STEP, (b, units)."""
         every = model.beams
         used = np.arange(every // 2, len(image), every)
         offsets = np.rint((BEARINGS[used] - math.radians(0.5)) / (math.tau / self.headings)).astype(int)
-        expected = np.arange(round(model.reach / STEP) + 1) * STEP
+        expected = np.linspace(0.0, model.reach, round(model.reach / STEP) + 1)
         return offsets, model.log_likelihood(image[used, None], expected).astype(np.float32)
 
 

@@ -1,12 +1,12 @@
 """A belief over dstates beside one over all poses of an occupancy grid: memory, time a step, steps until localised, and how often it is right, in the same drives.
 
-    python benchmarks/grid_localisation.py [--part aliasing|clutter|growing] [--seeds 5] [--first 600] [--save JSON]
+    python benchmarks/grid_localisation.py [--part aliasing|clutter|growing] [--seeds 10] [--first 600] [--save JSON] [--plot PNG] [--maps]
     python benchmarks/grid_localisation.py --from JSON [--plot PNG]
 
-prints tables for docs/localisation.md, or prints and draws what was saved. A robot of the simulator drives at random for 30 steps; then it is carried to another dstate, and drives for 30 more.
+prints tables for docs/localisation.md and draws its picture, which takes all parts; or prints and draws what was saved. A robot of the simulator drives at random for 30 steps; then it is carried to another dstate, and drives for 30 more.
 
 dstates by image, by view  the bootstrap loop has mapped the world from one exploration run, which tries each action at each dstate twice, and Localiser follows the robot in that map by its images
-                           or by the views that they are clustered to. It reads neither odometry nor stars
+                           or by the views that they are clustered to. It reads neither odometry nor stars. Never nowhere: as the peers below it is told that the robot is in the map
 grid                       a histogram filter over the cells and headings of an occupancy grid, with a beam model (grid_filter.py)
 particles                  Monte Carlo localisation in the same grid, with the same beam model
 
@@ -38,7 +38,8 @@ from perception.views import ViewClusterer
 from simulator.world import World
 from ssh_abduction import Localiser, Trace
 from ssh_abduction.learner import BootstrapLearner
-from ssh_abduction.localize import LOCATED
+from ssh_abduction.localize import LOCATED, Chances
+from ssh_abduction.reproduce.claims import one_to_one
 
 STEPS = 30  # of each of the two drives of a run
 EXPLORED = 2  # exploration tours
@@ -113,13 +114,35 @@ class Drive:
         )
 
 
-def by_dstates(drive: Drive, learner: BootstrapLearner, truth: Sequence[str], making: float, images: bool) -> Judged:
+@dataclass(frozen=True)
+class Learnt:
+    """What the bootstrap loop learnt from an exploration run, the true dstates of its steps, and CPU seconds."""
+
+    learner: BootstrapLearner
+    truth: list[str]
+    seconds: float
+
+    @classmethod
+    def of(cls, scene: Scene, case: Case, seed: int) -> Learnt:
+        explored = scene.explored(case.explored, seed)
+        learner = BootstrapLearner(None, ViewClusterer(random_state=0), limit=SECONDS)
+        began = process_time()
+        learner.fit(explored)
+        return cls(learner, [str(step.truth["dstate"]) for step in explored], process_time() - began)
+
+
+BY_IMAGE, SOMEWHERE, BY_VIEW = "dstates by image", "dstates by image, never nowhere", "dstates by view"
+
+
+def by_dstates(drive: Drive, learnt: Learnt, method: str) -> Judged:
     """Localiser in the map that was learnt. A dstate of that map is the true one that most of its images are of."""
-    named = {}
+    images = method != BY_VIEW
+    learner, named = learnt.learner, {}
     for x in range(len(learner.map_.dstates)):
-        here = Counter(name for name, label in zip(truth, learner.labels_, strict=True) if label == x)
+        here = Counter(name for name, label in zip(learnt.truth, learner.labels_, strict=True) if label == x)
         named[x] = here.most_common(1)[0][0] if here else None
-    localiser = Localiser(learner.map_, learner.recogniser_ if images else None)
+    chances = Chances(unmapped=0.0) if method == SOMEWHERE else Chances()
+    localiser = Localiser(learner.map_, learner.recogniser_ if images else None, chances=chances)
     centres = 0 if images else learner.clusterer_.cluster_centers_.nbytes
     began = process_time()
     trace = drive.trace
@@ -129,12 +152,12 @@ def by_dstates(drive: Drive, learner: BootstrapLearner, truth: Sequence[str], ma
     beliefs = list(localiser.beliefs(trace))
     following = process_time() - began
     return Judged(
-        "dstates by image" if images else "dstates by view",
+        method,
         tuple(b.dstate is not None and named[b.dstate] == at for b, at in zip(beliefs, drive.at, strict=True)),
         tuple(b.probability >= LOCATED for b in beliefs),
         len(pickle.dumps(localiser)) + centres,
         beliefs[0].probabilities.nbytes,
-        making,
+        learnt.seconds,
         following,
     )
 
@@ -158,14 +181,9 @@ def by_poses(drive: Drive, belief: Filter, method: str, grid: Grid, making: floa
 def run(case: Case, seed: int) -> Iterator[Judged]:
     scene = case.scene(seed)
     drive = Drive.of(scene, case, seed)
-    explored = scene.explored(case.explored, seed)
-    truth = [str(step.truth["dstate"]) for step in explored]
-    learner = BootstrapLearner(None, ViewClusterer(random_state=0), limit=SECONDS)
-    began = process_time()
-    learner.fit(explored)
-    making = process_time() - began
-    for images in (True, False):
-        yield by_dstates(drive, learner, truth, making, images)
+    learnt = Learnt.of(scene, case, seed)
+    for method in (BY_IMAGE, SOMEWHERE, BY_VIEW):
+        yield by_dstates(drive, learnt, method)
     for method, resolution, headings, sigma in ((COARSE, 0.1, 72, 0.2), (FINE, 0.025, 144, 0.05))[: 1 + case.fine]:
         began = process_time()
         grid = Grid.of(scene.world, resolution, headings)
@@ -195,15 +213,35 @@ PARTS: dict[str, list[Case]] = {
 Saved = dict[str, dict[str, list[list[Judged]]]]  # by part and case: of each seed, each method
 
 
+HEAD = """
+{}
+
+| world | belief over | localised after | in | found after being carried | in | right | sure and wrong | map, kB | belief, kB | CPU ms a step | map made in, CPU s |
+|---|---|---|---|---|---|---|---|---|---|---|---|"""
+
+
 def measured(parts: Sequence[str], seeds: range, save: str | None) -> Saved:
     found: Saved = {}
     for part in parts:
+        print(HEAD.format(part), flush=True)
         for case in PARTS[part]:
             found.setdefault(part, {})[case.name] = [list(run(case, seed)) for seed in seeds]
-            show({part: {case.name: found[part][case.name]}})
+            show(case.name, found[part][case.name])
             if save:
                 Path(save).write_text(json.dumps(found, default=asdict))
     return found
+
+
+def maps(parts: Sequence[str], seeds: range) -> None:
+    """Only what the bootstrap loop learns: how many of its maps are the true ones."""
+    print("| world | dstates | steps explored | maps that are the true one |\n|---|---|---|---|")
+    for case in (case for part in parts for case in PARTS[part] if part != "clutter"):
+        learnt = [Learnt.of(case.scene(seed), case, seed) for seed in seeds]
+        right = sum(one_to_one(one.learner.labels_, np.array(one.truth)) for one in learnt)
+        sizes = [
+            spread([float(size) for size in some], "{:g}") for some in ([len(set(x.truth)) for x in learnt], [len(x.truth) for x in learnt])
+        ]
+        print(f"| {case.name} | {' | '.join(sizes)} | {right} of {len(learnt)} |", flush=True)
 
 
 def loaded(path: str) -> Saved:
@@ -217,15 +255,9 @@ def loaded(path: str) -> Saved:
     }
 
 
-def show(found: Saved) -> None:
-    for part, cases in found.items():
-        print(
-            f"\n{part}\n\n| world | belief over | localised after | in | found after being carried | in | right | sure and wrong | "
-            "map, kB | belief, kB | CPU ms a step | map made in, CPU s |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
-        )
-        for case, runs in cases.items():
-            for same in zip(*runs, strict=True):
-                print(f"| {case} | {same[0].method} | {' | '.join(cells(same))} |", flush=True)
+def show(case: str, runs: Sequence[Sequence[Judged]]) -> None:
+    for same in zip(*runs, strict=True):
+        print(f"| {case} | {same[0].method} | {' | '.join(cells(same))} |", flush=True)
 
 
 def cells(runs: Sequence[Judged]) -> list[str]:
@@ -296,22 +328,32 @@ def draw(path: str, found: Saved) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--part", choices=PARTS, action="append")
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=600)
+    parser.add_argument("--maps", action="store_true", help="only say how many of the maps that are learnt are the true ones")
     parser.add_argument("--save", metavar="JSON")
     parser.add_argument("--from", dest="source", metavar="JSON", nargs="+")
     parser.add_argument("--plot", metavar="PNG")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    if not options.source:
-        measured(options.part or list(PARTS), range(options.first, options.first + options.seeds), options.save)
+    parts, seeds = options.part or list(PARTS), range(options.first, options.first + options.seeds)
+    if options.maps:
+        maps(parts, seeds)
         return
     found: Saved = {}
-    for path in options.source:
-        for part, cases in loaded(path).items():
-            found.setdefault(part, {}).update(cases)
-    show(found)
+    if options.source:
+        for path in options.source:
+            for part, cases in loaded(path).items():
+                found.setdefault(part, {}).update(cases)
+        for part, cases in found.items():
+            print(HEAD.format(part))
+            for case, runs in cases.items():
+                show(case, runs)
+    else:
+        found = measured(parts, seeds, options.save)
     if options.plot:
+        if set(found) != set(PARTS):
+            parser.error(f"--plot: expected {', '.join(PARTS)}, got {', '.join(found)} only; measure the others, too")
         draw(options.plot, found)
 
 

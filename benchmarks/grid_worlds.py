@@ -115,14 +115,15 @@ def rectangle(depth: float) -> Scene:
 
 
 def taylor_hall() -> Scene:
-    at = {"D1": -15j, "P1": 0j, "P2": 13 + 0j, "D2": 13 - 10j, "P3": 28 + 0j, "D3": 28 - 13j, "E": 40 + 0j}
-    streets = [("D1", "P1"), ("P1", "P2"), ("P2", "D2"), ("P2", "P3"), ("P3", "D3"), ("P3", "E")]
-    return of_streets(planar.world(at, streets), ("D1", "P1"), 1.0, World.named("taylor-hall"))  # type: ignore[arg-type]
+    at: dict[object, complex] = {"D1": -15j, "P1": 0j, "P2": 13 + 0j, "D2": 13 - 10j, "P3": 28 + 0j, "D3": 28 - 13j, "E": 40 + 0j}
+    streets: list[tuple[object, object]] = [("D1", "P1"), ("P1", "P2"), ("P2", "D2"), ("P2", "P3"), ("P3", "D3"), ("P3", "E")]
+    return of_streets(planar.world(at, streets), ("D1", "P1"), 1.0, World.named("taylor-hall"))
 
 
 def comb(halls: int) -> Scene:
     """A main hallway with so many side hallways, all alike, 6 m from each other."""
-    at: dict[object, complex] = {f"P{i}": 6.0 * i + 0j for i in range(halls)} | {f"D{i}": 6.0 * i - 6j for i in range(halls)}
+    at: dict[object, complex] = {f"P{i}": 6.0 * i + 0j for i in range(halls)}
+    at |= {f"D{i}": 6.0 * i - 6j for i in range(halls)}
     streets: list[tuple[object, object]] = [(f"P{i}", f"P{i + 1}") for i in range(halls - 1)]
     return of_streets(planar.world(at, streets + [(f"P{i}", f"D{i}") for i in range(halls)]), ("P0", "P1"), 0.8)
 
