@@ -166,7 +166,7 @@ def test_a_run_compares_all_methods_and_can_be_saved(
     monkeypatch: pytest.MonkeyPatch, tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(grid_localisation, "STEPS", 6)
-    monkeypatch.setattr(grid_localisation, "PARTS", {"aliasing": [Case("maze", lambda seed: maze(2, seed))]})
+    monkeypatch.setattr(grid_localisation, "PARTS", {"aliasing": [Case("maze", lambda seed: maze(2, seed), people=0.5)]})
     path = f"{tmp_path}/found.json"
     found = grid_localisation.measured(["aliasing"], range(1), path)
     assert grid_localisation.loaded(path) == found
