@@ -1,6 +1,7 @@
 # make demo   install what the lock says into .venv, solve a real route and show the map
 # make bench  time and memory on this machine, ours and those of peers from PyPI, as a table; the better part of an hour
 # make bench-faults  the same of faults: are they found, by ours and by peers; some hours, or ARGS="--seeds 2 --limit 10"
+# make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; an hour, or ARGS="--part growing --seeds 1"
 # make parts  times of single parts: circuits, images, exploring step by step, and small traces
 # make test   the same, with the tools of development: lint, types, layers, tests
 PYTHON ?= python3
@@ -8,7 +9,7 @@ BIN := .venv/bin
 export PIP_CONSTRAINT := $(CURDIR)/requirements.lock
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint bench bench-faults parts lock clean
+.PHONY: demo test lint bench bench-faults bench-grid parts lock clean
 
 demo: .venv/base
 	$(BIN)/python examples/demo.py out
@@ -27,6 +28,9 @@ bench: .venv/bench
 
 bench-faults: .venv/bench
 	$(BIN)/python benchmarks/faults.py $(ARGS)
+
+bench-grid: .venv/base
+	$(BIN)/python benchmarks/grid_localisation.py $(ARGS)
 
 parts: .venv/dev
 	$(BIN)/python benchmarks/circuits.py

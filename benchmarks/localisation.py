@@ -243,9 +243,9 @@ def part_images(seeds: range) -> None:
             print(f"| {name} | {tours} | {' | '.join(cells)} |", flush=True)
 
 
-def in_front(images: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Puts somebody in front of the laser in one image of twenty, from 0.4 to 0.8 m away, over a sixth of the beams. Returns in which."""
-    front = rng.random(len(images)) < 0.05
+def in_front(images: NDArray[np.float64], rng: np.random.Generator, share: float = 0.05) -> NDArray[np.bool_]:
+    """Puts somebody in front of the laser in this share of the images, from 0.4 to 0.8 m away, over a sixth of the beams. Returns in which."""
+    front = rng.random(len(images)) < share
     width = images.shape[1] // 6
     for image in (images[i] for i in np.flatnonzero(front)):
         begin = rng.integers(0, len(image) - width)

@@ -1,0 +1,367 @@
+"""Markov localisation over all poses: an occupancy grid with a histogram filter, and with particles. What benchmarks/localisation.py is compared with by grid_localisation.py.
+
+Written from the books and papers, whose sections are named here:
+  Thrun, Burgard & Fox 2005, Probabilistic Robotics: the beam model (6.3), the histogram filter (8.2), Monte Carlo localisation with random particles (8.3), KLD sampling (8.3.7)
+  Fox, Burgard & Thrun 1999, Markov localization for mobile robots in dynamic environments: expected ranges are looked up in a table that is made beforehand (4.1)
+
+A pose is a free cell and a heading. The belief is p(pose | all ranges and displacements so far). A displacement moves and blurs it, as its covariance says and as the size of the
+cells demands; an image weighs it by the beam model; and with a small chance the robot is anywhere, as it may have been kidnapped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+from scipy.special import log_ndtr, ndtr
+
+from simulator.laser import BEARINGS
+from simulator.world import World
+
+Array = NDArray[np.float64]
+Pose = tuple[float, float, float]
+# Expected ranges are stored in centimetres, in two bytes each: the laser's noise is half of that.
+STEP = 0.01
+# Displacements blur a belief over cells by at least this many cells: a narrower Gaussian is not one on a grid.
+LEAST_BLUR = 0.3
+# A heading at which no pose is more probable than this, as a share of what it is where nothing is known, is not moved: selective updating (Fox, Burgard & Thrun 1999, 4.2).
+IDLE = 0.1
+
+
+@dataclass(frozen=True)
+class BeamModel:
+    """How likely a range is where another one is expected: a mixture of four parts (Probabilistic Robotics, table 6.1). The defaults are those of ROS's AMCL, made to sum to one.
+
+    hit    the wall that is expected, seen with Gaussian noise of `sigma` metres; what is beyond `reach` reads as `reach`
+    short  something nearer, as a person: exponential, with `rate` a metre, up to the range that is expected
+    lost   nothing comes back, which reads as `reach`
+    any    anything, evenly
+    beams  every so many degrees a beam is used. Neighbouring beams err together, and are left out, as the model takes beams to be independent
+    """
+
+    hit: float = 0.95
+    short: float = 0.1
+    lost: float = 0.05
+    any: float = 0.05
+    sigma: float = 0.2
+    rate: float = 0.1
+    reach: float = 8.0
+    beams: int = 10
+
+    def log_likelihood(self, measured: float | Array, expected: Array) -> Array:
+        """The logarithm of the density of ranges below `reach`, and of the probability of `reach` itself; metres, and arrays that fit each other."""
+        z, e = np.broadcast_arrays(np.asarray(measured, float), np.asarray(expected, float))
+        total = self.hit + self.short + self.lost + self.any
+        nearer = np.maximum(e, STEP)
+        # Gaussian noise makes no range below 0, so the Gaussian is cut off there.
+        scale = np.exp(log_ndtr(e / self.sigma))
+        bell = np.exp(-(((z - e) / self.sigma) ** 2) / 2) / (self.sigma * math.sqrt(2 * math.pi)) / scale
+        decay = self.rate * np.exp(-self.rate * z) / -np.expm1(-self.rate * nearer) * (z <= nearer)
+        inside = self.hit * bell + self.short * decay + self.any / self.reach
+        beyond = self.hit * ndtr((e - self.reach) / self.sigma) / scale + self.lost
+        logs: Array = np.log(np.where(z < self.reach, inside, beyond) / total)
+        return logs
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """An occupancy grid, and the ranges that a laser would measure in it.
+
+    resolution  metres of a cell
+    headings    how many headings there are, evenly around; ranges are expected in as many directions
+    origin      x and y of the corner of cell (0, 0)
+    occupied    (rows, columns): walls
+    free        (rows, columns): cells where the robot may be, which are those connected with the one where it is known to start
+    ranges      (free cells, headings): the range that is expected from the middle of a cell in the direction of each heading, turned by half a degree as the beams are; units of STEP
+    """
+
+    resolution: float
+    headings: int
+    origin: tuple[float, float]
+    occupied: NDArray[np.bool_] = field(repr=False)
+    free: NDArray[np.bool_] = field(repr=False)
+    ranges: NDArray[np.uint16] = field(repr=False)
+
+    @classmethod
+    def of(cls, world: World, resolution: float = 0.1, headings: int = 72, reach: float = 8.0) -> Grid:
+        """The grid of a world's walls; clutter counts where it stands in the world's file."""
+        if headings % 72:
+            raise ValueError(f"headings: expected a multiple of 72, so that beams are in the directions of headings, got {headings}")
+        segments = np.vstack([world.segments, *(item.segments for item in world.clutter)])
+        points = np.vstack([_along(s, resolution / 4) for s in segments])
+        low = points.min(0) - 1.5 * resolution
+        cells = np.floor((points - low) / resolution).astype(int)
+        columns, rows = cells.max(0) + 2
+        occupied = np.zeros((rows, columns), bool)
+        occupied[cells[:, 1], cells[:, 0]] = True
+        parts, _ = ndimage.label(~occupied)
+        column, row = np.floor((np.array(world.start[:2]) - low) / resolution).astype(int)
+        free = parts == parts[row, column]
+        return cls(resolution, headings, (float(low[0]), float(low[1])), occupied, free, _cast(occupied, free, resolution, headings, reach))
+
+    @cached_property
+    def centres(self) -> Array:
+        """The middles of the free cells, (free cells, 2), in metres."""
+        rows, columns = np.nonzero(self.free)
+        return np.asarray((np.column_stack([columns, rows]) + 0.5) * self.resolution + np.array(self.origin), np.float64)
+
+    @cached_property
+    def number(self) -> NDArray[np.int32]:
+        """The number of each free cell, (rows, columns); -1 for the others."""
+        found = np.full(self.free.shape, -1, np.int32)
+        found[self.free] = np.arange(self.free.sum())
+        return found
+
+    @cached_property
+    def angles(self) -> Array:
+        """The headings, in radians."""
+        return np.asarray(np.arange(self.headings) * (math.tau / self.headings), np.float64)
+
+    def likelihoods(self, image: Array, model: BeamModel) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """For the beams used their directions against the heading, in headings, (b,); and log p(range | expected) for each expected range in units of STEP, (b, units)."""
+        every = model.beams
+        used = np.arange(every // 2, len(image), every)
+        offsets = np.rint((BEARINGS[used] - math.radians(0.5)) / (math.tau / self.headings)).astype(int)
+        expected = np.linspace(0.0, model.reach, round(model.reach / STEP) + 1)
+        return offsets, model.log_likelihood(image[used, None], expected).astype(np.float32)
+
+
+def _along(segment: Array, step: float) -> Array:
+    """Points on a segment, at most so far apart."""
+    start, end = segment[:2], segment[2:]
+    count = max(2, math.ceil(float(np.hypot(*(end - start))) / step) + 1)
+    return np.asarray(start + np.linspace(0, 1, count)[:, None] * (end - start))
+
+
+def _cast(occupied: NDArray[np.bool_], free: NDArray[np.bool_], resolution: float, headings: int, reach: float) -> NDArray[np.uint16]:
+    """Walks from all free cells at once in each direction, in strides of half a cell, until a cell is occupied."""
+    rows, columns = np.nonzero(free)
+    ranges = np.full((len(rows), headings), round(reach / STEP), np.uint16)
+    for h in range(headings):
+        angle = h * math.tau / headings + math.radians(0.5)
+        left = np.arange(len(rows))
+        for stride in range(1, math.ceil(2 * reach / resolution)):
+            way = stride / 2
+            row = np.floor(rows[left] + 0.5 + way * math.sin(angle)).astype(int).clip(0, occupied.shape[0] - 1)
+            column = np.floor(columns[left] + 0.5 + way * math.cos(angle)).astype(int).clip(0, occupied.shape[1] - 1)
+            hit = occupied[row, column]
+            ranges[left[hit], h] = round(way * resolution / STEP)
+            left = left[~hit]
+            if not len(left):
+                break
+    return ranges
+
+
+class Filter(Protocol):
+    """A belief over poses."""
+
+    def moved(self, displacement: Sequence[float], covariance: Array) -> None:
+        """Take into account a displacement (dx, dy, dtheta), in metres and radians and in the robot's frame, and its covariance (3, 3)."""
+
+    def seen(self, image: Array) -> None:
+        """Take into account an image, (180,) metres."""
+
+    def best(self) -> Pose:
+        """The most probable pose."""
+        ...
+
+    def mass(self, pose: Sequence[float], near: float, turned: float) -> float:
+        """How probable it is that the robot is within so many metres and radians of a pose."""
+        ...
+
+    @property
+    def bytes(self) -> int:
+        """Of the belief."""
+        ...
+
+
+class Histogram:
+    """A probability for each pose of a grid (Probabilistic Robotics, table 8.1).
+
+    slipped      the chance, at each step, that the robot is anywhere, whatever its wheels say
+    probability  (headings, rows, columns)
+
+    """
+
+    def __init__(self, grid: Grid, model: BeamModel | None = None, slipped: float = 0.01) -> None:
+        self.grid, self.model, self.slipped = grid, model or BeamModel(), slipped
+        self.anywhere = 1 / (float(grid.free.sum()) * grid.headings)
+        self.probability = np.where(grid.free, np.float32(self.anywhere), np.float32(0)) * np.ones((grid.headings, 1, 1), np.float32)
+
+    @property
+    def bytes(self) -> int:
+        return self.probability.nbytes
+
+    def moved(self, displacement: Sequence[float], covariance: Array) -> None:
+        """The belief is moved and blurred by a Gaussian, for each heading by another one. In the frequency domain both are one product, also for parts of a cell.
+
+        A heading stands for all those in its bin: so the further the robot goes, the more the belief spreads to the side. That errors of heading and position go together within a step is left out.
+        """
+        grid = self.grid
+        dx, dy, turned = displacement
+        way, size, bin_ = math.hypot(dx, dy), grid.resolution, math.tau / grid.headings
+        rows, columns = grid.free.shape
+        margin = math.ceil(way / size) + 8
+        shape = fft.next_fast_len(rows + margin), fft.next_fast_len(columns + margin, real=True)
+        ky, kx = math.tau * fft.fftfreq(shape[0])[:, None], math.tau * fft.rfftfreq(shape[1])
+        aside = np.array([-dy, dx]) * (bin_ / math.sqrt(12))
+        spread = np.asarray(covariance)[:2, :2] + np.outer(aside, aside)
+        for h in np.flatnonzero(self.probability.max(axis=(1, 2)) > IDLE * self.anywhere):
+            angle = grid.angles[h]
+            cos, sin = math.cos(angle), math.sin(angle)
+            turn = np.array([[cos, -sin], [sin, cos]])
+            x, y = turn @ (dx, dy) / size
+            (xx, xy), (_, yy) = turn @ spread @ turn.T / size**2 + LEAST_BLUR**2 * np.eye(2)
+            kernel = np.exp(-1j * (kx * x + ky * y) - (xx * kx**2 + 2 * xy * kx * ky + yy * ky**2) / 2)
+            layer = fft.irfft2(fft.rfft2(self.probability[h].astype(float), shape) * kernel, shape)
+            self.probability[h] = np.maximum(layer[:rows, :columns], 0)
+        k = math.tau * fft.rfftfreq(grid.headings)
+        variance = max(float(covariance[2][2]) / bin_**2, LEAST_BLUR**2)
+        kernel = np.exp(-1j * k * (turned / bin_) - variance * k**2 / 2)
+        spectrum = fft.rfft(self.probability, axis=0) * kernel[:, None, None].astype(np.complex64)
+        self.probability = np.maximum(fft.irfft(spectrum, grid.headings, axis=0), 0).astype(np.float32) * grid.free
+        total = float(self.probability.sum(dtype=float))
+        self.probability *= np.float32((1 - self.slipped) / total if total > 0 else 0.0)
+        self.probability += np.where(grid.free, np.float32((self.slipped if total > 0 else 1.0) * self.anywhere), np.float32(0))
+
+    def seen(self, image: Array) -> None:
+        grid = self.grid
+        offsets, logs = grid.likelihoods(image, self.model)
+        likely = np.zeros((grid.headings, len(grid.ranges)), np.float32)
+        for h in range(grid.headings):
+            for offset, log in zip(offsets, logs, strict=True):
+                likely[h] += log[grid.ranges[:, (h + offset) % grid.headings]]
+        weighed = self.probability[:, grid.free] * np.exp(likely - likely.max())
+        self.probability[:, grid.free] = weighed / weighed.sum(dtype=float)
+
+    def best(self) -> Pose:
+        h, row, column = np.unravel_index(int(self.probability.argmax()), self.probability.shape)
+        x, y = np.array([column, row]) * self.grid.resolution + self.grid.resolution / 2 + np.array(self.grid.origin)
+        return float(x), float(y), float(self.grid.angles[h])
+
+    def mass(self, pose: Sequence[float], near: float, turned: float) -> float:
+        here = np.hypot(*(self.grid.centres - pose[:2]).T) <= near
+        facing = _apart(self.grid.angles, pose[2]) <= turned + 1e-9
+        return float(self.probability[facing][:, self.grid.free][:, here].sum(dtype=float))
+
+
+class Particles:
+    """Poses drawn from the belief: Monte Carlo localisation, with the same table of ranges (Probabilistic Robotics, tables 8.2 and 8.4).
+
+    dense    particles for each square metre of free cells where the robot may be anywhere and face anywhere
+    error    KLD sampling keeps as many particles as are needed so that the distance between them and the belief is at most this, with a probability of 99 %; AMCL's default
+    least    particles that are kept in any case: twenty times as many as AMCL keeps, with which more of the poses that look alike were lost
+    slipped  the chance, at each step, that the robot is anywhere: so many of 100 particles are drawn from anywhere at each step. Where these explain an image better than
+             the others, the belief is drawn anew from anywhere, by that image (sensor resetting, Lenser & Veloso 2000)
+    """
+
+    BIN = np.array([0.5, 0.5, math.radians(10)])  # AMCL's bins of KLD sampling: metres, metres, radians
+
+    def __init__(
+        self,
+        grid: Grid,
+        model: BeamModel | None = None,
+        slipped: float = 0.01,
+        *,
+        dense: float = 4000.0,
+        error: float = 0.01,
+        least: int = 2000,
+        seed: int = 0,
+    ) -> None:
+        self.grid, self.model, self.slipped = grid, model or BeamModel(), slipped
+        self.error, self.least, self.rng = error, least, np.random.default_rng(seed)
+        self.most = max(least, round(dense * float(grid.free.sum()) * grid.resolution**2))
+        self._begin()
+
+    def _begin(self) -> None:
+        self.poses, self.weights = self._drawn(self.most), np.full(self.most, 1 / self.most)
+        self.fresh = 0  # the last so many particles were drawn from anywhere for this step
+
+    @property
+    def bytes(self) -> int:
+        return self.poses.nbytes + self.weights.nbytes
+
+    def _drawn(self, count: int) -> Array:
+        """Poses from anywhere."""
+        cells = self.grid.centres[self.rng.integers(len(self.grid.centres), size=count)]
+        return np.column_stack(
+            [cells + self.rng.uniform(-0.5, 0.5, (count, 2)) * self.grid.resolution, self.rng.uniform(0, math.tau, count)]
+        )
+
+    def moved(self, displacement: Sequence[float], covariance: Array) -> None:
+        self._resample()
+        dx, dy, turned = self.rng.multivariate_normal(displacement, covariance, size=len(self.poses), method="cholesky").T
+        cos, sin = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
+        self.poses += np.column_stack([cos * dx - sin * dy, sin * dx + cos * dy, turned])
+        self.poses[:, 2] %= math.tau
+        self.fresh = math.ceil(self.slipped * self.most)
+        if self.fresh:
+            self.poses = np.vstack([self.poses, self._drawn(self.fresh)])
+            self.weights = np.append(self.weights * (1 - self.slipped), np.full(self.fresh, self.slipped / self.fresh))
+
+    def seen(self, image: Array) -> None:
+        if self._weigh(image):
+            return
+        self._begin()
+        self._weigh(image)
+
+    def _weigh(self, image: Array) -> bool:
+        """Weigh the particles by an image, and say whether those that followed the robot explain it better than those drawn from anywhere."""
+        grid = self.grid
+        offsets, logs = grid.likelihoods(image, self.model)
+        columns, rows = np.floor((self.poses[:, :2] - grid.origin) / grid.resolution).astype(int).T
+        inside = (rows >= 0) & (columns >= 0) & (rows < grid.free.shape[0]) & (columns < grid.free.shape[1])
+        cells = np.where(inside, grid.number[rows * inside, columns * inside], -1)
+        h = np.rint(self.poses[:, 2] / (math.tau / grid.headings)).astype(int)
+        weights = np.where(cells < 0, -np.inf, np.log(np.maximum(self.weights, 1e-300)))
+        for offset, log in zip(offsets, logs, strict=True):
+            weights += log[grid.ranges[cells, (h + offset) % grid.headings]]
+        if not np.isfinite(weights.max()):
+            return False
+        weights = np.exp(weights - weights.max())
+        self.weights = weights / weights.sum()
+        return float(self.weights[len(weights) - self.fresh :].sum()) <= 0.5
+
+    def _resample(self) -> None:
+        """Draw as many particles as KLD sampling asks for, evenly along the weights (tables 4.4 and 8.4)."""
+        bins = len(np.unique(self._bins(self.poses[np.unique(self._chosen(self.most))])))
+        self.poses = self.poses[self._chosen(min(self.most, max(self.least, _kld(bins, self.error))))]
+        self.weights = np.full(len(self.poses), 1 / len(self.poses))
+
+    def _bins(self, poses: Array) -> NDArray[np.intp]:
+        """A number for the bin of each pose."""
+        indices = np.floor(poses / self.BIN).astype(np.intp)
+        return np.asarray(indices @ (1, 1 << 20, 1 << 40))
+
+    def _chosen(self, count: int) -> NDArray[np.intp]:
+        places = (np.arange(count) + self.rng.random()) / count
+        return np.minimum(np.searchsorted(np.cumsum(self.weights), places), len(self.weights) - 1)
+
+    def best(self) -> Pose:
+        """The mean of the particles in the bin that has most of the weight."""
+        _, of = np.unique(self._bins(self.poses), return_inverse=True)
+        heaviest = of == np.bincount(of, self.weights).argmax()
+        x, y, heading = np.average(self.poses[heaviest], axis=0, weights=self.weights[heaviest])
+        return float(x), float(y), float(heading)
+
+    def mass(self, pose: Sequence[float], near: float, turned: float) -> float:
+        here = np.hypot(*(self.poses[:, :2] - pose[:2]).T) <= near
+        return float(self.weights[here & (_apart(self.poses[:, 2], pose[2]) <= turned)].sum())
+
+
+def _kld(bins: int, error: float) -> int:
+    """Particles for so many bins (Probabilistic Robotics, equation 8.12, by Wilson and Hilferty's approximation of chi-square); 2.326 is the normal quantile of 99 %."""
+    if bins < 2:
+        return 0
+    part = 2 / (9 * (bins - 1))
+    return math.ceil((bins - 1) / (2 * error) * (1 - part + math.sqrt(part) * 2.326) ** 3)
+
+
+def _apart(angles: Array, angle: float) -> Array:
+    return np.abs((angles - angle + math.pi) % math.tau - math.pi)
