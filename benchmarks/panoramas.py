@@ -1,9 +1,9 @@
 """The bootstrap loop on panoramas of the simulated worlds: which features and which clusterings suit them. The tables and the figure of docs/panoramas.md.
 
-    python benchmarks/panoramas.py [--seeds 300-304] [--page docs/panoramas.md]
+    python benchmarks/panoramas.py [--seeds 300-302] [--page docs/panoramas.md]
     python benchmarks/panoramas.py --figure docs/panoramas.png
 
-A drive is clustered (k by M, at most 24), mapped from the views alone for at most one second, and its recogniser is asked for the dstates of a second drive, at other hours. Each
+A drive is clustered (k by M, at most 24), mapped from the views alone for at most two seconds, and its recogniser is asked for the dstates of a second drive, at other hours. Each
 seed has its own drive, noise and textures.
 """
 
@@ -47,12 +47,12 @@ from ssh_abduction.reproduce.claims import VIEWS_ALONE, one_to_one, true_dstates
 from ssh_abduction.trace import Trace
 
 Pixels = NDArray[np.float64]
-SECONDS, MOST_VIEWS = 1.0, 24
+SECONDS, MOST_VIEWS = 2.0, 24
 DOUBTS = (ImageWarning, RunnerUpWarning, AmbiguousMapWarning)
 # Hours at which a drive begins and ends, and those of the drive that is asked for.
 LIGHTS = {"lamps": ((20.0, 20.0), (20.0, 20.0)), "a day": ((7.0, 19.0), (18.0, 8.0))}
 TEXTURES = {"unique": False, "repeated": True}
-TOURS = {"notched rectangle": 10, "Taylor Hall": 5, "maze": 6}
+TOURS = {"notched rectangle": 8, "Taylor Hall": 4, "maze": 4}
 
 
 @cache
@@ -130,7 +130,8 @@ class Found:
     purity       U: 1 where each dstate has one view
     distinct     views by dstates: below 1 dstates share views, above it they have several
     right        whether the map has the true dstates
-    said         whether there was a warning
+    said         whether there was a warning, or no map
+    doubted      whether a warning said that images are doubtful, views overlap, or another number of views gives another map; not that a map was not proven in time, which depends on the machine
     recognised   the share of the images of the second drive whose true dstate the nearest image of the first drive has, by its true dstates: what the features are worth, whatever the map
     by_map       the same by the labels of the map, as the recogniser that the loop has learnt answers, labels and true dstates one to one; 0 where there is no map
     """
@@ -141,6 +142,7 @@ class Found:
     distinct: float
     right: bool
     said: bool
+    doubted: bool
     recognised: float
     by_map: float
 
@@ -166,7 +168,7 @@ def drives(name: str, light: str, texture: str, seed: int) -> tuple[Trace, Trace
     """A drive to learn from, and one to be asked for."""
     camera = Camera(paint=Paint(seed, TEXTURES[texture]))
     first, second = (replace(camera, hours=hours) for hours in LIGHTS[light])
-    return simulate(world(name), TOURS[name], seed, camera=first), simulate(world(name), 2, 10_000 + seed, camera=second)
+    return simulate(world(name), TOURS[name], seed, camera=first), simulate(world(name), 1, 10_000 + seed, camera=second)
 
 
 def found(learnt: Trace, asked: Trace, features: str, clusterer: str) -> Found:
@@ -180,6 +182,7 @@ def found(learnt: Trace, asked: Trace, features: str, clusterer: str) -> Found:
         with suppress(LearnerError, PerceptionError):
             learner.fit(learnt)
     said = not hasattr(learner, "labels_") or any(issubclass(w.category, DOUBTS) for w in caught)
+    doubted = any(w.category is ImageWarning or "give another map" in str(w.message) for w in caught)
     views, first = learner.views_, learner.features_.transform(images_of(learnt))
     second = learner.features_.transform(images_of(asked))
     mapped = by_map = 0.0
@@ -194,6 +197,7 @@ def found(learnt: Trace, asked: Trace, features: str, clusterer: str) -> Found:
         distinct=len(set(views.tolist())) / len(set(truth.tolist())),
         right=bool(mapped),
         said=said,
+        doubted=doubted,
         recognised=float(np.mean(PlaceRecognizer().fit(first, truth).predict(second) == asked_truth)),
         by_map=by_map,
     )
@@ -216,7 +220,7 @@ def cells(results: list[Found]) -> str:
     ks = sorted({r.k for r in results})
     qualities = [r.quality for r in results]
     wrong_silently = sum(not r.right and not r.said for r in results)
-    right_doubted = sum(r.right and r.said for r in results)
+    right_doubted = sum(r.right and r.doubted for r in results)
     return " | ".join(
         [
             f"{ks[0]}" if len(ks) == 1 else f"{ks[0]}–{ks[-1]}",
@@ -237,23 +241,25 @@ HEAD = "k by M | M | U | views by dstates | map right | wrong, and nothing said 
 
 def tables(seeds: list[int], workers: int) -> Iterator[tuple[str, str]]:
     """The names of tables, and their lines: features in all worlds, then clusterings over a day."""
-    pairs = [(features, "k-means") for features in FEATURES]
-    pairs += [("PanoramaTransformer", clusterer) for clusterer in CLUSTERERS if clusterer != "k-means"]
-    pairs += [("raw pixels", clusterer) for clusterer in ("agglomerative, average", "HDBSCAN, 3 or more")]
-    groups = [(name, light, texture) for name in TOURS for light in LIGHTS for texture in TEXTURES]
-    with ProcessPoolExecutor(workers) as pool:
-        jobs = [(*group, seed) for group in groups for seed in seeds]
-        results = dict(zip(jobs, pool.map(partial(measured, pairs=pairs), jobs), strict=True))
+    by_k_means = [(features, "k-means") for features in FEATURES]
+    others = [("PanoramaTransformer", clusterer) for clusterer in CLUSTERERS if clusterer != "k-means"]
+    others += [("raw pixels", clusterer) for clusterer in ("agglomerative, average", "HDBSCAN, 3 or more")]
+    rows: dict[tuple[str, str], list[Found]] = {}
     yield "features", f"| world | light | textures | features | {HEAD} |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
-    for group in groups:
-        for i, (features, _) in enumerate(pairs[: len(FEATURES)]):
-            yield "features", f"| {' | '.join(group)} | {features} | {cells([results[*group, seed][i] for seed in seeds])} |"
-    yield "clusterings", f"| light | features | clustering | {HEAD} |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
-    for light in LIGHTS:
-        for i, (features, clusterer) in enumerate(pairs):
-            if features in ("raw pixels", "PanoramaTransformer"):
-                rows = [results[job][i] for job in results if job[1] == light]
-                yield "clusterings", f"| {light} | {features} | {clusterer} | {cells(rows)} |"
+    with ProcessPoolExecutor(workers) as pool:
+        for group in [(name, light, texture) for name in TOURS for light in LIGHTS for texture in TEXTURES]:
+            pairs = by_k_means + (others if group[1] == "a day" else [])
+            results = list(pool.map(partial(measured, pairs=pairs), [(*group, seed) for seed in seeds]))
+            for i, pair in enumerate(pairs):
+                of_pair = [result[i] for result in results]
+                if group[1] == "a day":
+                    rows.setdefault(pair, []).extend(of_pair)
+                if pair in by_k_means:
+                    yield "features", f"| {' | '.join(group)} | {pair[0]} | {cells(of_pair)} |"
+    yield "clusterings", f"| features | clustering | {HEAD} |\n|---|---|---|---|---|---|---|---|---|---|---|"
+    for pair in sorted(rows, key=lambda pair: (list(FEATURES).index(pair[0]), list(CLUSTERERS).index(pair[1]))):
+        if pair[0] in ("raw pixels", "PanoramaTransformer"):
+            yield "clusterings", f"| {' | '.join(pair)} | {cells(rows[pair])} |"
 
 
 def figure(path: Path, seed: int = 1) -> None:
@@ -285,7 +291,7 @@ def figure(path: Path, seed: int = 1) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--seeds", default="300-304", help="first and last seed")
+    parser.add_argument("--seeds", default="300-302", help="first and last seed")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--page", type=Path, help="page whose tables are to be replaced")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw some panoramas instead")

@@ -14,8 +14,9 @@ from sklearn.preprocessing import FunctionTransformer
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from perception.appearance import PanoramaTransformer, features_of
-from perception.errors import ImageWarning, PerceptionError
+from perception.errors import PerceptionError
 from perception.images import images_of
+from perception.quality import uncertainty_coefficient
 from perception.recognition import recogniser
 from perception.store import load, save
 from perception.views import ViewClusterer
@@ -190,17 +191,16 @@ def test_the_robot_drives_the_same_with_a_camera_and_without(run: Trace) -> None
     assert last.sum() > 1.05 * first.sum()  # from seven o'clock to noon
 
 
-@pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning", "ignore::ssh_abduction.labels.AmbiguousMapWarning")
-def test_the_loop_has_the_true_map_over_a_day_where_raw_pixels_have_not(run: Trace) -> None:
+@pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
+def test_the_loop_has_the_true_map_over_a_day_where_views_of_raw_pixels_cannot(run: Trace) -> None:
     clusterer = ViewClusterer(k_max=12, n_init=3, random_state=0)
     learner = BootstrapLearner(VIEWS_ALONE, clusterer).fit(run)
     assert one_to_one(learner.labels_, true_dstates(run))
     assert (len(learner.map_.dstates), len(learner.map_.places), len(learner.map_.paths)) == (8, 4, 4)
     later = simulate(ROOM, tours=2, seed=501, camera=replace(SMALL, hours=(19.0, 8.0)))
     assert learner.score(later) == 1
-    with pytest.warns(ImageWarning, match="views overlap"):
-        raw = BootstrapLearner(VIEWS_ALONE, clusterer, limit=0.2, features=FunctionTransformer()).fit(run)
-    assert not one_to_one(raw.labels_, true_dstates(run))
+    raw = clusterer.fit(images_of(run) / 255)
+    assert uncertainty_coefficient(raw.labels_, true_dstates(run)) < 0.9  # dstates have several views, so no map of these is the true one
 
 
 @pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
