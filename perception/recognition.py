@@ -84,9 +84,14 @@ class PlaceRecognizer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return validate_data(self, equal_length(X), dtype=np.float64, reset=False)
 
 
-def recogniser(floor: float = 0.05, n_neighbors: int = 1) -> Pipeline:
-    """From ranges in metres, (n, d), to labels: reciprocals, then the nearest neighbour. Not fitted yet."""
-    return Pipeline([("reciprocal", ReciprocalTransformer(floor)), ("nearest", PlaceRecognizer(n_neighbors))])
+def recogniser(floor: float = 0.05, n_neighbors: int = 1, features: Any = None) -> Pipeline:
+    """From images, (n, d), to labels: features, then the nearest neighbour. Not fitted yet.
+
+    floor     of the reciprocals of ranges in metres, which are the features where no others are given
+    features  a transformer of scikit-learn's kind for other images, such as a PanoramaTransformer. It is cloned
+    """
+    made = ("reciprocal", ReciprocalTransformer(floor)) if features is None else ("features", clone(features))
+    return Pipeline([made, ("nearest", PlaceRecognizer(n_neighbors))])
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator
 from sklearn.pipeline import Pipeline
 
+from perception.appearance import PanoramaTransformer
 from perception.errors import PerceptionError
 from perception.likelihood import ImageLikelihood
 from perception.reciprocal import ReciprocalTransformer
@@ -29,7 +30,9 @@ from ssh_abduction.errors import brief, is_whole
 from ssh_abduction.files import write_file
 
 FORMAT, VERSION = "ssh-recogniser", 1
-OURS = tuple(f"{kind.__module__}.{kind.__qualname__}" for kind in (PlaceRecognizer, ReciprocalTransformer, ViewClusterer))
+OURS = tuple(
+    f"{kind.__module__}.{kind.__qualname__}" for kind in (PlaceRecognizer, PanoramaTransformer, ReciprocalTransformer, ViewClusterer)
+)
 # Bytes that a file may have once it is unpacked: a small archive may claim to hold more than the memory.
 LARGEST = 4 * 2**30
 

@@ -44,16 +44,21 @@ class Laser:
 
     def _cast(self, segments: Array, poses: Array) -> Array:
         """The distance from each pose to the nearest wall along each beam, (m, 180) metres."""
-        angles = poses[:, 2, None] + BEARINGS
-        dx, dy = np.cos(angles)[:, :, None], np.sin(angles)[:, :, None]
-        ax = segments[:, 0] - poses[:, 0, None]
-        ay = segments[:, 1] - poses[:, 1, None]
-        ex, ey = segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1]
-        # The ray r (dx, dy) meets the wall a + s e, 0 <= s <= 1, where r (dx, dy) = a + s e. Cross products with e and with (dx, dy) yield r and s.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = 1.0 / (dx * ey - dy * ex)
-            r = (ax * ey - ay * ex)[:, None, :] * inverse
-            s = (ax[:, None, :] * dy - ay[:, None, :] * dx) * inverse
-            hit = (r > 0) & (s >= 0) & (s <= 1)
-        nearest: Array = np.minimum(np.where(hit, r, np.inf).min(axis=2), self.reach)
+        nearest: Array = np.minimum(meetings(segments, poses, BEARINGS).min(axis=2), self.reach)
         return nearest
+
+
+def meetings(segments: Array, poses: Array, bearings: Array) -> Array:
+    """The distance from each of m poses, along each of b bearings, to each of w walls, (m, b, w) metres; infinity where the ray does not meet the wall."""
+    angles = poses[:, 2, None] + bearings
+    dx, dy = np.cos(angles)[:, :, None], np.sin(angles)[:, :, None]
+    ax = segments[:, 0] - poses[:, 0, None]
+    ay = segments[:, 1] - poses[:, 1, None]
+    ex, ey = segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1]
+    # The ray r (dx, dy) meets the wall a + s e, 0 <= s <= 1, where r (dx, dy) = a + s e. Cross products with e and with (dx, dy) yield r and s.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / (dx * ey - dy * ex)
+        r = (ax * ey - ay * ex)[:, None, :] * inverse
+        s = (ax[:, None, :] * dy - ay[:, None, :] * dx) * inverse
+        hit = (r > 0) & (s >= 0) & (s <= 1)
+    return np.where(hit, r, np.inf)

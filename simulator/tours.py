@@ -14,6 +14,7 @@ from simulator.errors import SimulatorError
 from simulator.junctions import ACTIONS, Pilot
 from simulator.laser import Laser
 from simulator.motion import DIGITS
+from simulator.panorama import Camera
 from simulator.robot import Body, Report, Robot
 from simulator.world import World
 from ssh_abduction.odometry import Covariance, Displacement, Odometry
@@ -61,11 +62,14 @@ def simulate(
     tolerance: Tolerance | None = None,
     stars: bool = True,
     every: float | None = None,
+    camera: Camera | None = None,
 ) -> Trace:
     """Drive `tours` tours, and log an image at each dstate: (tours x actions) steps, of which the last one has no action.
 
     stars   also log the openings at each place, as the robot saw them since it came there
     every   log an image each so many metres of odometry instead, wherever the robot is; the trace then has travels only
+    camera  log its panoramas instead of ranges, row by row, as whole numbers; `panorama` in the trace's header is their shape. The robot drives by its laser as before, so with one seed
+            both drives are the same
     Each step has as its displacement what the robot's odometry says of all motions since the last step, those of hill-climbing included;
     the trace's odometry is the noise that fits them. The truth goes into `truth`: dstate, place, path and pose. Nothing but evaluation may read it.
     Raises SimulatorError where the route cannot be driven.
@@ -85,10 +89,12 @@ def simulate(
     tolerance = tolerance or Tolerance()
     driver = Driver(world.arranged(rng), robot, laser or Laser(), rng, tolerance)
     log = Log(robot)
-    steps = list(_at_dstates(driver, log, world, tours, stars)) if every is None else _evenly(driver, log, world, tours, every)
+    eye = Eye(camera, len(world.segments), np.random.default_rng([seed, 1]), tours * len(world.route))
+    steps = list(_at_dstates(driver, log, world, tours, stars, eye)) if every is None else _evenly(driver, log, world, tours, every, eye)
     steps[-1] = replace(steps[-1], action=None)
     odometry = _noise(log, world, body, tolerance if every is None else None)
-    return Trace(tuple(steps), name=f"{world.name}, {tours} tours, seed {seed}", odometry=odometry)
+    extra = {} if camera is None else {"panorama": list(camera.shape)}
+    return Trace(tuple(steps), name=f"{world.name}, {tours} tours, seed {seed}", odometry=odometry, extra=extra)
 
 
 def _noise(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> Odometry:
@@ -96,6 +102,27 @@ def _noise(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> O
     if world.angles == "any" and tolerance is not None:
         return Odometry(scale=abs(body.scale), bend=abs(body.bend))
     return noise_model(log.reports, body, tolerance)
+
+
+@dataclass
+class Eye:
+    """What is logged as the image of a step: the ranges of the laser, or what a camera sees instead.
+
+    walls    how many segments of the world are no clutter
+    actions  how many there are in the run, by which the hour is told
+    """
+
+    camera: Camera | None
+    walls: int
+    rng: np.random.Generator
+    actions: int
+
+    def image(self, driver: Driver, ranges: Array, done: int) -> tuple[float, ...]:
+        """The image that is logged after so many actions."""
+        if self.camera is None:
+            return tuple(round(float(r), 4) for r in ranges)
+        hour = self.camera.hour(done / max(self.actions - 1, 1))
+        return tuple(self.camera.shot(driver.world, driver.robot.pose, self.rng, hour, self.walls).ravel().tolist())
 
 
 @dataclass
@@ -145,9 +172,9 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
     return Odometry.of({name: round(error, 6) for name, error in errors.items()})
 
 
-def _at_dstates(driver: Driver, log: Log, world: World, tours: int, stars: bool) -> Iterator[Step]:
+def _at_dstates(driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye) -> Iterator[Step]:
     if world.angles == "any":
-        yield from _at_junctions(driver, log, world, tours, stars)
+        yield from _at_junctions(driver, log, world, tours, stars, eye)
         return
     star = Star(world.reach)
     climb(driver)
@@ -161,11 +188,11 @@ def _at_dstates(driver: Driver, log: Log, world: World, tours: int, stars: bool)
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
-        for action in world.route:
+        for number, action in enumerate(world.route):
             image = driver.look(STILL)
             star.look(image)
             yield Step(
-                image=_metres(image),
+                image=eye.image(driver, image, tour * len(world.route) + number),
                 action=Action.of(action),
                 star=star.seen() if stars else None,
                 displacement=log.displacement(),
@@ -175,7 +202,7 @@ def _at_dstates(driver: Driver, log: Log, world: World, tours: int, stars: bool)
             star.act(action)
 
 
-def _at_junctions(driver: Driver, log: Log, world: World, tours: int, stars: bool) -> Iterator[Step]:
+def _at_junctions(driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye) -> Iterator[Step]:
     """The same where streets meet at any angles. How much the robot turned to look around differs from step to step, so each displacement has a covariance of its own."""
     pilot = Pilot(driver)
     pilot.begin()
@@ -183,10 +210,10 @@ def _at_junctions(driver: Driver, log: Log, world: World, tours: int, stars: boo
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
-        for action in world.route:
+        for number, action in enumerate(world.route):
             displacement = log.displacement()
             yield Step(
-                image=_metres(driver.look(STILL)),
+                image=eye.image(driver, driver.look(STILL), tour * len(world.route) + number),
                 action=ACTIONS[action],
                 star=pilot.star() if stars else None,
                 displacement=displacement,
@@ -211,7 +238,7 @@ def _covariance(report: Report, tolerance: Tolerance, action: str) -> Covariance
     return a, b, c  # type: ignore[return-value]
 
 
-def _evenly(driver: Driver, log: Log, world: World, tours: int, every: float) -> list[Step]:
+def _evenly(driver: Driver, log: Log, world: World, tours: int, every: float, eye: Eye) -> list[Step]:
     """Images each `every` metres of odometry. What is at most that far along the route counts as one spot, tour after tour."""
     logged: list[Step] = []
     leg_began = due = 0.0
@@ -222,7 +249,7 @@ def _evenly(driver: Driver, log: Log, world: World, tours: int, every: float) ->
         if driver.robot.driven >= due:
             spot = f"leg {leg % len(world.route)}, {round((driver.robot.driven - leg_began) / every)}"
             truth = {"dstate": spot, "pose": [round(v, 4) for v in driver.robot.pose]}
-            image = _metres(driver.look(STILL))
+            image = eye.image(driver, driver.look(STILL), leg)
             logged.append(Step(image=image, action=Action.of("travel"), displacement=log.displacement(), truth=truth))
             due += every
 
@@ -237,10 +264,6 @@ def _evenly(driver: Driver, log: Log, world: World, tours: int, every: float) ->
             pilot.act(action) if pilot else act(driver, action)
             leg += 1
     return logged
-
-
-def _metres(image: Array) -> tuple[float, ...]:
-    return tuple(round(float(r), 4) for r in image)
 
 
 def _truth(world: World, pose: Sequence[float]) -> dict[str, object]:

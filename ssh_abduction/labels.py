@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,15 +64,17 @@ def map_of(solution: Solution, choose: int | None = None) -> tuple[SSHMap, NDArr
     return solution.maps[choose or 0], labels
 
 
-def labels_of_all(ssh_map: SSHMap, labels: NDArray[np.intp], traces: Traces, views: NDArray[np.intp]) -> NDArray[np.intp]:
+def labels_of_all(
+    ssh_map: SSHMap, labels: NDArray[np.intp], traces: Traces, views: NDArray[np.intp], features: Any = None
+) -> NDArray[np.intp]:
     """The label of each step of several traces, (n,): of the longest trace its labels, as the map was made for it, and of the others what the map tells.
 
-    A step without a view, which is -1 among `views` (n,), has no label (-1). Warns where another trace contradicts the map, or cannot be placed on it.
+    `features` are those by which images are compared, as in `recogniser`. A step without a view, which is -1 among `views` (n,), has no label (-1). Warns where another trace contradicts the map, or cannot be placed on it.
     """
     if len(traces.each) == 1:
         return np.where(views == NOISE, -1, labels)
     own = traces.parts(traces.images)[traces.longest]
-    looks = recogniser().fit(own[labels >= 0], labels[labels >= 0]).predict(traces.images)
+    looks = recogniser(features=features).fit(own[labels >= 0], labels[labels >= 0]).predict(traces.images)
     found = labels_on(ssh_map, traces, views, looks)
     for i, part in enumerate(traces.parts(found)):
         if i == traces.longest:

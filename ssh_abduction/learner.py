@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, clone
 
 from perception.confidence import warn_of_doubts
-from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import recogniser
 from perception.views import ViewClusterer, as_view_clusterer
 from ssh_abduction.labels import AmbiguousMapWarning, LearnerError, labels_of, labels_of_all, labels_on, map_of
@@ -37,15 +36,24 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     clusterer  makes views of images: a ViewClusterer, or a clusterer of scikit-learn's. It is cloned. ViewClusterer(random_state=0) by default
     choose     the index of the map to take where several remain; None takes the labels on which all of them agree
     limit      seconds for finding the map
+    features   makes of images what is clustered and compared: a transformer of scikit-learn's kind. It is cloned. None for reciprocals of ranges, and for a PanoramaTransformer where
+               the header of a trace says that its images are panoramas
 
-    After `fit` there are clusterer_, views_ and confidence_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree or an image has no view,
+    After `fit` there are features_, clusterer_, views_ and confidence_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree or an image has no view,
     recogniser_, and second_map_, the map of the runner-up, where another number of views is about as good and gives another map.
 
     Of several traces all images make the views, the longest trace makes the map, and the others are followed on it; n counts their steps, one after the other.
     """
 
-    def __init__(self, theory: Theory | None = None, clusterer: Any = None, choose: int | None = None, limit: float | None = None) -> None:
-        self.theory, self.clusterer, self.choose, self.limit = theory, clusterer, choose, limit
+    def __init__(
+        self,
+        theory: Theory | None = None,
+        clusterer: Any = None,
+        choose: int | None = None,
+        limit: float | None = None,
+        features: Any = None,
+    ) -> None:
+        self.theory, self.clusterer, self.choose, self.limit, self.features = theory, clusterer, choose, limit, features
 
     def fit(self, X: Trace | Sequence[Trace], y: Any = None) -> BootstrapLearner:
         """Run the loop on a trace, or on several. Raises LearnerError, PerceptionError, TraceError."""
@@ -54,9 +62,9 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         self.solution_ = solve(seen.each[seen.longest], theory, limit=self.limit)
         self.map_, mapped = map_of(self.solution_, self.choose)
         self.second_map_ = warn_of_second_map(seen.each[seen.longest], self.solution_.maps, theory, self.limit)
-        self.labels_ = labels_of_all(self.map_, mapped, seen, self.views_)
+        self.labels_ = labels_of_all(self.map_, mapped, seen, self.views_, self.features_)
         sure = self.labels_ >= 0
-        self.recogniser_ = recogniser().fit(traces.images[sure], self.labels_[sure])
+        self.recogniser_ = recogniser(features=self.features_).fit(traces.images[sure], self.labels_[sure])
         return self
 
     def predict(self, X: Trace | Sequence[Trace] | ArrayLike) -> NDArray[np.intp]:
@@ -83,7 +91,8 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
 
     def _look(self, traces: Traces) -> Traces:
         """The traces with their views, and, where there is one, with those of the runner-up."""
-        images = ReciprocalTransformer().fit_transform(traces.images)
+        self.features_ = (traces.features if self.features is None else clone(self.features)).fit(traces.images)
+        images = self.features_.transform(traces.images)
         self.clusterer_ = as_view_clusterer(ViewClusterer(random_state=0) if self.clusterer is None else clone(self.clusterer)).fit(images)
         self.views_, self.confidence_ = self.clusterer_.labels_, self.clusterer_.confidence_
         warn_of_doubts(self.views_, self.confidence_, self.clusterer_.quality_[self.clusterer_.k_])
@@ -91,5 +100,5 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
 
     def _followed(self, traces: Traces, looks: NDArray[np.intp]) -> NDArray[np.intp]:
         """The dstate of each step, by the map: -1 where it does not tell. `looks` are the dstates that the images look like."""
-        views = self.clusterer_.predict(ReciprocalTransformer().fit_transform(traces.images))
+        views = self.clusterer_.predict(self.features_.transform(traces.images))
         return labels_on(self.map_, traces, views, looks)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.appearance import features_of
 from perception.confidence import nearest_views
 from perception.errors import PerceptionError
 from perception.images import images_of
@@ -54,6 +55,17 @@ class Traces:
                     f"trace {i}: image: expected {tables[0].shape[1]} ranges, as trace 0 has, got {table.shape[1]}; {mend}"
                 )
         return np.concatenate(tables)
+
+    @property
+    def features(self) -> Any:
+        """What makes features of the images, not fitted yet. Raises PerceptionError where the traces have panoramas of different shapes, or some have ranges."""
+        kinds = [features_of(trace) for trace in self.each]
+        for i, kind in enumerate(kinds):
+            if (type(kind), kind.get_params()) != (type(kinds[0]), kinds[0].get_params()):
+                raise PerceptionError(
+                    f"trace {i}: image: expected one of the kind that trace 0 has, got {kind}, not {kinds[0]}; take traces of one sensor"
+                )
+        return kinds[0]
 
     @property
     def longest(self) -> int:

@@ -35,16 +35,17 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    from perception.appearance import features_of
     from perception.confidence import warn_of_doubts
     from perception.images import images_of
     from perception.quality import uncertainty_coefficient
-    from perception.reciprocal import ReciprocalTransformer
     from perception.views import ViewClusterer
 
     check_picture(options.plot)
     trace = Trace.load(options.trace)
-    images = ReciprocalTransformer().fit_transform(images_of(trace))
+    logged, features = images_of(trace), features_of(trace)
     try:
+        images = features.fit_transform(logged)
         clusterer = ViewClusterer(k=options.k, k_max=options.k_max, random_state=options.seed, by=options.by).fit(images)
     except SSHError as error:
         raise SSHError(f"{options.trace}: {error}") from None

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.options import Verbs, add_output, seed, write
 from ssh_abduction.cli.text import counted
-from ssh_abduction.errors import printable
+from ssh_abduction.errors import SSHError, named, printable
+
+if TYPE_CHECKING:
+    from simulator.panorama import Camera
+    from ssh_abduction.trace import Trace
 
 SHIPPED = ("notched-rectangle", "taylor-hall", "triangle", "three-ways", "five-ways", "six-ways")
 
@@ -28,6 +33,19 @@ def add_parser(verbs: Verbs) -> None:
     )
     errors.add_argument("--scale-error", type=float, default=0.0, metavar="SHARE", help="all ways are reported longer by this (default: 0)")
     errors.add_argument("--bend-error", type=float, default=0.0, metavar="DEGREES", help="drift of the heading in each metre (default: 0)")
+    camera = parser.add_argument_group(
+        "panoramas", "what a camera sees that looks all around, for --images panoramas; they go to a file .npz beside the trace"
+    )
+    camera.add_argument(
+        "--images", choices=("ranges", "panoramas"), default="ranges", help="log ranges of the laser, or panoramas (default: ranges)"
+    )
+    camera.add_argument(
+        "--textures",
+        choices=("unique", "repeated"),
+        help="whether each wall has its own texture, or parallel ones the same (default: unique)",
+    )
+    camera.add_argument("--paint-seed", type=seed, metavar="SEED", help="seed of the textures (default: 0)")
+    camera.add_argument("--hours", metavar="FROM,TO", help="hours of the day at which the drive begins and ends (default: 12,12)")
     add_output(parser)
     parser.set_defaults(run=run)
 
@@ -42,6 +60,49 @@ def run(options: argparse.Namespace) -> int:
     noise = Body.odometry if options.odometry_noise is None else options.odometry_noise
     body = Body(odometry=noise, scale=options.scale_error, bend=math.radians(options.bend_error))
     world = World.named(options.world).with_choices(options.start, options.route, options.reach)
-    trace = simulate(world, options.tours, options.seed, body=body, stars=not options.no_stars, every=options.every)
+    camera = _camera(options)
+    trace = simulate(world, options.tours, options.seed, body=body, stars=not options.no_stars, every=options.every, camera=camera)
+    if camera and options.output != "-":
+        trace = _with_table(trace, options.output)
     write(trace, options.output, f"{counted(len(trace), 'images')} of {printable(world.name)}")
     return 0
+
+
+def _camera(options: argparse.Namespace) -> Camera | None:
+    """The camera that was asked for. Raises SSHError."""
+    from simulator.panorama import Camera, Paint
+
+    if options.images == "ranges":
+        for name in ("textures", "paint_seed", "hours"):
+            if getattr(options, name) is not None:
+                raise SSHError(f"--{name.replace('_', '-')}: expected --images panoramas beside it, as ranges show no light; add that")
+        return None
+    paint = Paint(options.paint_seed or 0, repeated=options.textures == "repeated")
+    if options.hours is None:
+        return Camera(paint=paint)
+    try:
+        begin, end = (float(hour) for hour in options.hours.split(","))
+    except ValueError:
+        raise SSHError(f"--hours: expected two hours with a comma between them, as 7,19, got {options.hours!r}; write two") from None
+    return Camera(paint=paint, hours=(begin, end))
+
+
+def _with_table(trace: Trace, target: str) -> Trace:
+    """The trace whose panoramas are in a file beside it, which is written."""
+    import io
+    from dataclasses import replace
+    from pathlib import Path
+
+    import numpy as np
+
+    from ssh_abduction.files import write_file
+
+    path = Path(target).with_suffix(".npz")
+    packed = io.BytesIO()
+    np.savez_compressed(packed, images=np.array([step.image for step in trace.steps], np.uint8))
+    try:
+        write_file(path, packed.getvalue())
+    except (OSError, ValueError) as error:
+        raise SSHError(f"{named(path)}: cannot write the images: {error}; check the folder") from None
+    steps = tuple(replace(step, image=i) for i, step in enumerate(trace.steps))
+    return replace(trace, steps=steps, images=path.name)

@@ -52,14 +52,17 @@ def pair(text: str) -> tuple[int, int]:
     return int(first), int(second)
 
 
-def _labelled(options: argparse.Namespace) -> tuple[Any, Any]:
-    """The images of a trace and their labels, where these are sure."""
-    images, labels, _ = _mapped(options)
-    return images, labels
+def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
+    """The images of a trace and their labels, where these are sure, and a recogniser for such images, which has not learnt yet."""
+    from perception.recognition import recogniser
+
+    images, labels, _, features = _mapped(options)
+    return images, labels, recogniser(features=features)
 
 
-def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap]:
-    """The same, and the map whose labels they are."""
+def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
+    """The images and their labels, the map whose labels they are, and what makes features of the images."""
+    from perception.appearance import features_of
     from perception.images import images_of
     from ssh_abduction.learner import labels_of
 
@@ -78,15 +81,14 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap]:
             f"{options.maps}: expected labels for the {len(trace)} steps of {options.trace}, got {len(labels)}; solve this trace"
         )
     sure = labels >= 0
-    return images_of(trace)[sure], labels[sure], maps[(options.map or 1) - 1]
+    return images_of(trace)[sure], labels[sure], maps[(options.map or 1) - 1], features_of(trace)
 
 
 def run_train(options: argparse.Namespace) -> int:
-    from perception.recognition import recogniser
     from perception.store import save
 
-    images, labels = _labelled(options)
-    save(recogniser().fit(images, labels), options.output)
+    images, labels, recogniser = _labelled(options)
+    save(recogniser.fit(images, labels), options.output)
     print(f"{counted(len(set(labels.tolist())), 'dstates')} learnt from {counted(len(images), 'images')} in {named(options.output)}")
     return 0
 
@@ -95,9 +97,9 @@ def run_learning_curve(options: argparse.Namespace) -> int:
     from perception.recognition import learning_curve
 
     check_picture(options.plot)
-    images, labels = _labelled(options)
+    images, labels, recogniser = _labelled(options)
     sizes = sorted({len(images) * tenth // 10 for tenth in range(1, 11)} - {0})
-    curve = learning_curve(images, labels, sizes, folds=options.folds, random_state=options.seed)
+    curve = learning_curve(images, labels, sizes, folds=options.folds, random_state=options.seed, estimator=recogniser)
     if options.json:
         print(
             json.dumps({"sizes": curve.sizes, "mean": curve.mean, "lowest": curve.lowest, "highest": curve.highest, "folds": curve.folds})
@@ -140,7 +142,9 @@ def run_tell_apart(options: argparse.Namespace) -> int:
     from perception.reciprocal import ReciprocalTransformer
 
     check_picture(options.plot)
-    ranges, labels, ssh_map = _mapped(options)
+    ranges, labels, ssh_map, features = _mapped(options)
+    if not isinstance(features, ReciprocalTransformer):
+        raise MapError(f"{options.trace}: expected a trace with ranges, as beams are told of, got panoramas; take a trace of a laser")
     images = ReciprocalTransformer().fit_transform(ranges)
     views = {s.id: s.view for s in ssh_map.dstates}
     alike = [(a, b) for a in views for b in views if a < b and views[a] == views[b]]

@@ -1,0 +1,252 @@
+"""Panoramas: what the camera sees, features in which the light hardly shows, and the bootstrap loop on them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sklearn.cluster import AgglomerativeClustering
+from sklearn.preprocessing import FunctionTransformer
+from sklearn.utils.estimator_checks import parametrize_with_checks
+
+from perception.appearance import PanoramaTransformer, features_of
+from perception.errors import PerceptionError
+from perception.images import images_of
+from perception.quality import uncertainty_coefficient
+from perception.recognition import recogniser
+from perception.store import load, save
+from perception.views import ViewClusterer
+from simulator.errors import SimulatorError
+from simulator.laser import BEARINGS, Laser
+from simulator.panorama import CEILING, EYE, STEEPEST, Camera, Light, Paint
+from simulator.tours import simulate
+from simulator.world import World
+from ssh_abduction.cli import main
+from ssh_abduction.learner import BootstrapLearner
+from ssh_abduction.reproduce.claims import VIEWS_ALONE, one_to_one, true_dstates
+from ssh_abduction.trace import Trace
+
+ROOM = World.named("notched-rectangle")
+SMALL = Camera(rows=12, columns=60, paint=Paint(5, repeated=True), hours=(7.0, 19.0))
+
+
+@pytest.fixture(scope="module")
+def run() -> Trace:
+    return simulate(ROOM, tours=5, seed=500, camera=SMALL)
+
+
+@parametrize_with_checks([PanoramaTransformer()])
+@pytest.mark.filterwarnings("ignore")
+def test_the_transformer_keeps_the_rules_of_scikit_learn(estimator: Any, check: Any) -> None:
+    check(estimator)
+
+
+def test_walls_stand_as_high_as_the_laser_says_that_they_are_near(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Paint, "texture", lambda self, key: np.array([0.9] * 13 + [0.0] * 36))
+    monkeypatch.setattr("simulator.panorama.ACROSS", 1)
+    world, pose = World.named("taylor-hall"), (13.0, 0.2, 0.3)
+    camera = Camera(rows=2000 // 4, columns=360, noise=0, exposure=0)
+    bright = camera.scene(world, pose, Light(np.ones(3)))[..., 0] > 0.7
+    bearings = math.pi - (np.arange(360) + 0.5) * math.tau / 360
+    ahead = np.abs(bearings) < math.pi / 2
+    assert np.allclose(bearings[ahead][::-1], BEARINGS)
+    ranges = Laser(reach=1e6).exact(world, np.array([pose]))[0][::-1]
+    height = bright[:, ahead].mean(axis=0) * 2 * STEEPEST
+    expected = np.minimum((CEILING - EYE) / ranges, STEEPEST) + np.minimum(EYE / ranges, STEEPEST)
+    assert ranges.min() < 1.3
+    assert ranges.max() > 10
+    assert np.abs(height - expected).max() < 0.005
+
+
+def test_a_turn_of_the_robot_turns_the_panorama() -> None:
+    camera = Camera(noise=0, hours=(20.0, 20.0))
+    rng = np.random.default_rng(0)
+    first, turned = (camera.shot(ROOM, (3.0, 0.8, math.radians(degrees)), rng, 20.0) for degrees in (10.0, 50.0))
+    differences = np.abs(np.roll(first, 20, axis=1).astype(int) - turned)
+    assert (differences > 1).mean() < 0.01  # rays that meet the edge of a stripe
+    assert np.abs(first.astype(int) - turned).mean() > 5
+
+
+def test_what_is_in_the_middle_of_a_panorama_is_ahead() -> None:
+    """A robot that faces the near wall of a room sees it higher in the middle than at either end, which is behind."""
+    image = Camera(noise=0).shot(ROOM, (3.8, 1.0, 0.0), np.random.default_rng(0)).astype(int)
+    floor = np.abs(image[-1] - image[-1, 0]).max(axis=1) > 3
+    assert floor[90]
+    assert not floor[:3].any()
+
+
+def test_repeated_textures_make_opposite_corners_look_alike_and_unique_ones_do_not() -> None:
+    rectangle = replace(ROOM, segments=np.array([[0, 0, 4, 0], [4, 0, 4, 2], [4, 2, 0, 2], [0, 2, 0, 0]], float))
+    rng, poses = np.random.default_rng(0), ((3.4, 1.4, -math.pi / 2), (0.6, 0.6, math.pi / 2))
+    for repeated in (True, False):
+        a, b = (Camera(paint=Paint(2, repeated), noise=0).shot(rectangle, pose, rng, 20.0).astype(int) for pose in poses)
+        assert (np.abs(a - b).max() <= 1) == repeated
+    a, b = (Camera(paint=Paint(2, repeated=True), noise=0).shot(rectangle, pose, rng, 12.0).astype(int) for pose in poses)
+    assert np.abs(a - b).mean() > 5  # the sun is at one side
+
+
+def test_clutter_keeps_its_texture_where_it_is_moved() -> None:
+    paint = Paint(1)
+    box = np.array([[1.0, 1, 2, 1], [2, 1, 2, 2], [2, 2, 1, 2], [1, 2, 1, 1]])
+    before = paint.keys(np.vstack([ROOM.segments, box]), len(ROOM.segments))
+    after = paint.keys(np.vstack([ROOM.segments, box + 0.37]), len(ROOM.segments))
+    assert before == after
+    assert paint.keys(box, 4) != paint.keys(box + 0.37, 4)
+
+
+def test_the_sun_is_brightest_at_noon_and_reddest_when_it_is_low() -> None:
+    noon, morning, night = Light.at(12), Light.at(7), Light.at(23)
+    assert noon.colour.sum() > morning.colour.sum() > night.colour.sum() > 0
+    assert morning.colour[0] / morning.colour[2] > noon.colour[0] / noon.colour[2]
+    assert noon.on(np.array([-math.pi / 2]))[0] > 1 > noon.on(np.array([math.pi / 2]))[0]
+    assert night.on(np.array([0.0, 1.0, 2.0])).tolist() == [1, 1, 1]
+
+
+def test_a_camera_makes_up_for_brightness_by_its_exposure() -> None:
+    rng = np.random.default_rng(0)
+    by = {
+        exposure: [float(Camera(exposure=exposure, noise=0).shot(ROOM, ROOM.start, rng, hour).mean()) for hour in (9.0, 23.0)]
+        for exposure in (0.0, 0.5, 1.0)
+    }
+    ratios = [day / night for day, night in by.values()]
+    assert ratios[0] > 2 > ratios[1] > 1.3 > ratios[2]
+    assert ratios[2] == pytest.approx(1, abs=0.06)  # bright patches are cut off at 255
+
+
+def test_features_do_not_change_with_the_light() -> None:
+    """By brightness and colour they do not change at all; over the hours, with sun, noise and all, they change less than between places."""
+    rng = np.random.default_rng(0)
+    images = rng.uniform(5, 250, (4, 12 * 60 * 3))
+    made = PanoramaTransformer(SMALL.shape, floor=0).fit(images)
+    assert np.allclose(made.transform(images), made.transform((images.reshape(4, -1, 3) * [0.9, 0.5, 0.2]).reshape(4, -1)))
+    poses = [s.pose for s in ROOM.dstates]
+    hours = (7.0, 10.0, 13.0, 16.0, 19.0)
+    camera = replace(SMALL, paint=Paint(5))
+    table = np.array([camera.shot(ROOM, pose, rng, hour).ravel() for pose in poses for hour in hours], float)
+    of = np.repeat(np.arange(len(poses)), len(hours))
+    for features, parted in ((PanoramaTransformer(SMALL.shape), True), (FunctionTransformer(), False)):
+        x = features.fit_transform(table)
+        distances = np.linalg.norm(x[:, None] - x, axis=2)
+        same = of[:, None] == of
+        assert (distances[same].max() < distances[~same].min()) == parted
+
+
+def test_patches_that_do_not_divide_a_panorama_are_smaller() -> None:
+    image = np.arange(5 * 7, dtype=float).reshape(1, -1)
+    made = PanoramaTransformer((5, 7, 1), patch=(3, 4), floor=1.0).fit_transform(image)
+    table = image.reshape(5, 7)
+    means = np.array([[table[:3, :4].mean(), table[:3, 4:].mean()], [table[3:, :4].mean(), table[3:, 4:].mean()]])
+    logs = np.log(means + 1)
+    assert np.allclose(made, [[*(logs[0, ::-1] - logs[0]), *(logs[1, ::-1] - logs[1]), *(logs[1] - logs[0])]])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"shape": (2, 5, 3)}, "images: expected 2 x 5 x 3 values each, got 12"),
+        ({"shape": (2, 6)}, r"shape: expected 3 whole numbers of at least 1, got \(2, 6\)"),
+        ({"patch": (0, 1)}, "patch: expected 2 whole numbers of at least 1"),
+        ({"floor": -1.0}, "floor: expected a number of 0 or more, got -1.0"),
+    ],
+)
+def test_bad_settings_are_named(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(PerceptionError, match=message):
+        PanoramaTransformer(**settings).fit(np.ones((3, 12)))
+
+
+def test_bad_images_and_headers_are_named(run: Trace) -> None:
+    with pytest.raises(PerceptionError, match="images: expected values of 0 or more, got -3"):
+        PanoramaTransformer().fit([[1.0, 2.0]]).transform([[1.0, -3.0]])
+    with pytest.raises(PerceptionError, match=r"panorama: expected 3 whole numbers of at least 1, got \[24, 180\]"):
+        features_of(replace(run, extra={"panorama": [24, 180]}))
+    with pytest.raises(PerceptionError, match="trace 1: image: expected one of the kind that trace 0 has"):
+        BootstrapLearner(VIEWS_ALONE).fit([run, replace(run, extra={})])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"rows": 0}, "camera.rows: expected a whole number from 1 to 1000, got 0"),
+        ({"hours": (7.0, 25.0)}, "camera.hours: expected a number from 0 to 24, got 25.0"),
+        ({"exposure": math.nan}, "camera.exposure: expected a number from 0 to 1"),
+        ({"noise": -1.0}, "camera.noise: expected a number from 0 to 255, got -1.0"),
+    ],
+)
+def test_bad_cameras_are_named(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(SimulatorError, match=message):
+        Camera(**settings)
+
+
+def test_the_robot_drives_the_same_with_a_camera_and_without(run: Trace) -> None:
+    blind = simulate(ROOM, tours=5, seed=500)
+    assert [(s.action, s.star, s.displacement, s.truth) for s in blind.steps] == [
+        (s.action, s.star, s.displacement, s.truth) for s in run.steps
+    ]
+    assert images_of(run).shape == (40, 12 * 60 * 3)
+    first, last = (images_of(run)[i].reshape(-1, 3).mean(axis=0) for i in (0, 16))
+    assert last.sum() > 1.05 * first.sum()  # from seven o'clock to noon
+
+
+@pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
+def test_the_loop_has_the_true_map_over_a_day_where_views_of_raw_pixels_cannot(run: Trace) -> None:
+    clusterer = ViewClusterer(k_max=12, n_init=3, random_state=0)
+    learner = BootstrapLearner(VIEWS_ALONE, clusterer).fit(run)
+    assert one_to_one(learner.labels_, true_dstates(run))
+    assert (len(learner.map_.dstates), len(learner.map_.places), len(learner.map_.paths)) == (8, 4, 4)
+    later = simulate(ROOM, tours=2, seed=501, camera=replace(SMALL, hours=(19.0, 8.0)))
+    assert learner.score(later) == 1
+    raw = clusterer.fit(images_of(run) / 255)
+    assert uncertainty_coefficient(raw.labels_, true_dstates(run)) < 0.9  # dstates have several views, so no map of these is the true one
+
+
+@pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
+def test_any_clusterer_plugs_in(run: Trace) -> None:
+    part = replace(run, steps=(*run.steps[8:23], replace(run.steps[23], action=None)))
+    learner = BootstrapLearner(VIEWS_ALONE, AgglomerativeClustering(4, linkage="average")).fit([run, part])
+    assert one_to_one(learner.labels_, np.concatenate([true_dstates(run), true_dstates(run)[8:24]]))
+
+
+def test_a_recogniser_of_panoramas_is_stored(run: Trace, tmp_path: Path) -> None:
+    images, labels = images_of(run), np.arange(len(run)) % 8
+    save(recogniser(features=features_of(run)).fit(images, labels), tmp_path / "r.skops")
+    assert load(tmp_path / "r.skops").labels(images) == labels.tolist()
+
+
+@pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
+def test_panoramas_in_the_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    drive = "simulate notched-rectangle --tours 2 --images panoramas --textures repeated --paint-seed 5 --hours 8,18 --no-stars"
+    assert main([*drive.split(), "-o", "run.jsonl"]) == 0
+    trace = Trace.load("run.jsonl")
+    assert (trace.images, trace.extra["panorama"], trace.steps[3].image) == ("run.npz", [24, 180, 3], 3)
+    camera = Camera(paint=Paint(5, repeated=True), hours=(8.0, 18.0))
+    inline = simulate(ROOM, 2, stars=False, camera=camera)
+    assert np.array_equal(images_of(trace), images_of(inline))
+    assert main(["cluster", "run.jsonl", "--k-max", "5", "-o", "views.jsonl"]) == 0
+    assert main(["solve", "views.jsonl", "--json"]) == 0
+    out = capsys.readouterr().out
+    (tmp_path / "maps.json").write_text(out[out.index("{") :])
+    assert main(["train", "views.jsonl", "maps.json", "-o", "r.skops"]) == 0
+    assert main(["recognise", "r.skops", "run.jsonl", "--json"]) == 0
+    assert len(set(capsys.readouterr().out.split("[")[1].strip("]\n ").split(", "))) == 8
+    assert main(["tell-apart", "views.jsonl", "maps.json"]) == 1
+    assert "expected a trace with ranges" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--hours 7,19", "--hours: expected --images panoramas beside it"),
+        ("--textures unique", "--textures: expected --images panoramas beside it"),
+        ("--images panoramas --hours noon", "--hours: expected two hours with a comma between them, as 7,19, got 'noon'"),
+        ("--images panoramas --hours 7,nan", "camera.hours: expected a number from 0 to 24, got nan"),
+    ],
+)
+def test_bad_options_are_named(options: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "notched-rectangle", *options.split(), "-o", str(tmp_path / "x.jsonl")]) == 1
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
