@@ -22,15 +22,18 @@ import resource
 import signal
 import statistics
 import sys
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Hashable, Iterable, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 from cell import cpu_seconds, end_after
 from fault_cases import FAMILIES, PRICE, Case, Explanation
 from fault_peers import PEERS
+from scipy.optimize import linear_sum_assignment
 
 from ssh_abduction import Progress, Search, SSHMap, Status, Theory
 from ssh_abduction.asp import limits
@@ -49,6 +52,7 @@ COLUMNS = (
     "proven",
     "faults found",
     "in vain",
+    "labels right",
     "CPU s, median",
     "worst",
     "truth not the only cheapest",
@@ -175,7 +179,17 @@ def judged(case: Case, explanations: Sequence[Explanation], proven: bool) -> Rec
         "named": len(first.faults),
         "states": len(set(first.labels)),
         "tenths": first.tenths,
+        "accuracy": accuracy(first.labels, case.walk.truth),
     }
+
+
+def accuracy(labels: Sequence[int], truth: Sequence[Hashable]) -> float:
+    """The share of steps with the right label, under the one-to-one assignment of labels to true states that makes it largest (Kuhn 1955)."""
+    votes = Counter(zip(labels, truth, strict=True))
+    names, states = list(dict.fromkeys(labels)), list(dict.fromkeys(truth))
+    table = np.array([[votes[name, state] for state in states] for name in names])
+    rows, columns = linear_sum_assignment(table, maximize=True)
+    return float(table[rows, columns].sum() / len(labels))
 
 
 def true_tenths(case: Case) -> int:
@@ -223,6 +237,7 @@ def cells(solver: str, records: Sequence[Record]) -> list[str]:
         share("proven") if solver not in PEERS or PEERS[solver].proves else "–",
         f"{found} of {faults}",
         f"{named - found}",
+        f"{statistics.mean(r.get('accuracy', 0.0) for r in ran):.3f}",
         time_of(statistics.median(seconds), limit),
         time_of(max(seconds), limit),
         rivals(ran) if solver not in PEERS else "–",
