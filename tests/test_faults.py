@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import faulty_machine
 
-from ssh_abduction import OnlineMapper, Speedups, Status, Step, Theory, Trace, solve
+from ssh_abduction import Speedups, Status, Step, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.engines import faulty
 from ssh_abduction.errors import MapError, TheoryError
@@ -273,11 +273,6 @@ def test_the_front_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "expected a causal theory" in capsys.readouterr().err
     assert main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--within", "1"]) == 1
     assert "within: expected 0 where faults are allowed" in capsys.readouterr().err
-
-
-def test_a_driving_robot_is_not_told_of_faults() -> None:
-    with pytest.raises(TheoryError, match="expected no faults while the robot drives"):
-        OnlineMapper("v0", Theory.causal().replace(misread=1.5))
 
 
 def test_a_limit_leaves_a_map_and_a_bound() -> None:

@@ -43,6 +43,10 @@ where it was stopped, and may prove a map minimal again.
 
 Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`online/background.py`), one after another,
 in a process of their own, and mended there where that takes longer than a step may.
+
+Where faults are allowed
+------------------------
+Then `recovery.py` keeps the maps. What contradicts all of them does not end the run: it says what broke, keeps a belief over what may be true, and restores the map. `standing` says how sure it is.
 """
 
 from __future__ import annotations
@@ -73,6 +77,7 @@ from ssh_abduction.trace import Action, Step, Trace, View
 
 if TYPE_CHECKING:
     from ssh_abduction.online.background import MapGuess
+    from ssh_abduction.online.recovery import Recovery, Standing
 
 # After a search that was stopped the trace grows by this factor before the next one, so that few steps are slow.
 RETRY = 1.01
@@ -92,8 +97,9 @@ class OnlineMapper:
     """Keeps the minimal maps current while a robot drives. `solution` is the answer for the steps so far.
 
     view     what is seen at first
-    theory   which axioms and which preference; Theory.topological() by default. The first step settles star=auto, the first displacement displacement=auto
+    theory   which axioms and which preference; Theory.topological() by default. With faults (misread, slipped) `standing` says how sure the map is. The first step settles star=auto, the first displacement displacement=auto
     star     the openings seen at first, as in Step, if the theory uses stars
+    confidence  how probable it is that what is seen at first is right, as in Step, where faults are allowed
     odometry  how far displacements that come without a covariance may be off, as in Trace; None for the defaults
     limit    seconds that a step may take, about: clingo cannot be stopped while it grounds a step. None waits for the exact answer
     maps     keep at most so many maps; 0 keeps all
@@ -106,15 +112,14 @@ class OnlineMapper:
         theory: Theory | None = None,
         *,
         star: Sequence[float] | None = None,
+        confidence: float | None = None,
         odometry: Odometry | Mapping[str, Any] | None = None,
         limit: float | None = 0.5,
         maps: int = 100,
         speedups: Speedups = ALL,
     ) -> None:
-        first = Step.of(view, star, "step 0")
+        first = replace(Step.of(view, star, "step 0"), confidence=confidence)
         theory = checked_theory(theory)
-        if theory.has_faults:
-            raise TheoryError("theory: expected no faults while the robot drives, got misread or slipped; leave them out, or solve the log")
         check_limit("limit", "seconds", limit)
         checked_speedups(speedups)
         self._odometry = None if odometry is None else Odometry.of(odometry)
@@ -122,22 +127,44 @@ class OnlineMapper:
         settled = theory.replace(displacement="none").resolve(self.trace)  # of displacements the first step says nothing
         self._without_stars = theory.star == "auto" and settled.star == "none"
         self._unsettled = theory.replace(star=settled.star)
+        self._steps = [first]
+        self._actions: dict[str, Action] = {}
+        self._limit, self._most, self._speedups = limit, maps, speedups
+        self._recovery: Recovery | None = None
+        if theory.has_faults:
+            from ssh_abduction.online.recovery import Recovery  # loads numpy
+
+            self.theory = self._settled_theory()
+            self._recovery = Recovery(self.trace, self.theory, limit=limit, maps=maps, speedups=speedups)
+            self.solution = self._recovery.solution
+            return
         if theory.level == "causal":  # now rather than at the step that first needs it, as it takes its time
             importlib.import_module("ssh_abduction.engines.causal")
         elif row("visits").holds_for(settled):
             importlib.import_module("ssh_abduction.online.background")
         began = time.perf_counter()
-        self.searches = 0  # how often clingo was asked
-        self._limit, self._most, self._speedups = limit, maps, speedups
-        self._steps = [first]
+        self._searches = 0
         self._seen = [observation(first, settled)]
-        self._actions: dict[str, Action] = {}
         self._guess: MapGuess | None = None
         self._next_guess = GUESSED  # not before the trace has so many steps
         self._mending = MENDING  # seconds, by the square of the number of steps
         self._begin_with(self._settled_theory())
         self._ask()
         self.solution = self._answer(began)
+
+    @property
+    def searches(self) -> int:
+        """How often clingo was asked."""
+        return self._recovery.searches if self._recovery else self._searches
+
+    @property
+    def standing(self) -> Standing:
+        """How sure the map is, what broke, and what may be true. Raises TheoryError where the theory has no faults: `solution` says all then."""
+        if self._recovery is None:
+            raise TheoryError(
+                "theory: expected faults, as without them nothing is disbelieved, got none; take misread or slipped, or read the solution"
+            )
+        return self._recovery.standing
 
     def _begin_with(self, theory: Theory) -> None:
         """Begin anew, with nothing known of the maps of the steps so far but sketches."""
@@ -192,19 +219,22 @@ class OnlineMapper:
         star: Sequence[float] | None = None,
         displacement: Sequence[float] | None = None,
         covariance: Sequence[Sequence[float]] | None = None,
+        confidence: float | None = None,
     ) -> Solution:
         """Take in an action and what was seen then, and say what the minimal maps are now.
 
         displacement  [dx, dy, dtheta] of the action, in metres and radians, as in Step; None where it is not known
         covariance    of the displacement, (3, 3); None where the odometry tells it
+        confidence    how probable it is that the view, and the star, are right, as in Step; it scales what it costs to disbelieve them
 
         Raises TraceError where the step does not fit theory and trace; the mapper stays as it was.
         """
         began = time.perf_counter()
         done = Action.of(action)
         step = Step.of(view, star, f"step {len(self._steps)}", displacement=displacement, covariance=covariance)
+        step = replace(step, confidence=confidence)
         self._take(done, step, began)
-        self.solution = self._answer(began)
+        self.solution = self._recovery.solution if self._recovery else self._answer(began)
         return self.solution
 
     def _take(self, action: Action, step: Step, began: float) -> None:
@@ -213,8 +243,12 @@ class OnlineMapper:
         self._check(action, last, step)
         self._actions[action.name] = action
         self._steps[-1:] = [last, step]
-        self._seen.append(observation(step, self.theory))
         self.trace = Trace(tuple(self._steps), odometry=self._odometry)
+        if self._recovery:
+            self.theory = self.theory if self._is_settled() else self._settled_theory()
+            self._recovery.take(self.trace, self.theory, began)
+            return
+        self._seen.append(observation(step, self.theory))
         known = self.solution.maps[0] if self._maps or self._drafts else None
         if self._is_settled():
             if self._status is Status.UNSATISFIABLE and self._replays:
@@ -333,7 +367,7 @@ class OnlineMapper:
 
     def _ask(self) -> None:
         """Let clingo say what the minimal maps are, or the best map it finds in time."""
-        self.searches += 1
+        self._searches += 1
         known = self._maps[0].map() if self._status is Status.OPTIMAL else None
         search = Search(
             self.trace, self.theory, limit=self._limit, maps=self._most, speedups=self._speedups, after=self._search, minimal=known

@@ -1,0 +1,275 @@
+"""The mapper that recovers from faults: exact after every step, and certain again when evidence is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+from unittest.mock import patch
+
+import pytest
+import recovery as bench
+from fault_cases import rectangle_of_five
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_faults import cheapest, small_traces, told
+
+from ssh_abduction import Belief, OnlineMapper, Solution, Speedups, Status, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction.asp.process import _under_way
+from ssh_abduction.judge.checker import check
+from ssh_abduction.online import recovery
+from ssh_abduction.online.meanwhile import Meanwhile
+from ssh_abduction.online.rivals import Rival, Scale
+
+NO_TIME = 1e-9  # seconds: every search is stopped before it begins
+BOTH = Theory.causal().replace(misread=1.5, slipped=3)
+
+
+def followed(
+    trace: Trace, theory: Theory, limit: float | None = None, maps: int = 0, speedups: Speedups | None = None
+) -> Iterator[tuple[OnlineMapper, Solution]]:
+    """The mapper after each step of a trace, and its answer."""
+    first, *rest = trace.steps
+    mapper = OnlineMapper(
+        first.view or "",
+        theory,
+        star=first.star,
+        confidence=first.confidence,
+        odometry=trace.odometry,
+        limit=limit,
+        maps=maps,
+        speedups=speedups or Speedups(),
+    )
+    yield mapper, mapper.solution
+    for action, step in zip(trace.actions, rest, strict=True):
+        yield mapper, mapper.observe(action, step.view or "", star=step.star, displacement=step.displacement, confidence=step.confidence)
+
+
+def circuit(steps: int, wrong: int | None = None, seen: str = "v3") -> Trace:
+    """Round a rectangle of four views, one of which is perhaps wrong."""
+    return Trace.from_steps(
+        [seen if t == wrong else f"v{t % 4}" for t in range(steps + 1)], [("right", "travel")[t % 2] for t in range(steps)]
+    )
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(small_traces(max_steps=7), st.sampled_from([0.0, 0.4, 1.0]), st.sampled_from([0.0, 0.3, 1.0]))
+def test_after_every_step_the_maps_are_those_of_brute_force(trace: Trace, misread: float, slipped: float) -> None:
+    if not misread and not slipped:
+        return
+    for mapper, solution in followed(trace, Theory.causal().replace(misread=misread, slipped=slipped)):
+        cost, expected = cheapest(trace.prefix(solution.steps), round(10 * misread), round(10 * slipped))
+        assert solution.status is Status.OPTIMAL
+        assert solution.complete
+        assert solution.cost is not None
+        assert (solution.cost.tenths, solution.bound.tenths) == (cost, cost)
+        assert {told(ssh_map) for ssh_map in solution.maps} == expected
+        assert len(solution.maps) == len(expected)
+        if mapper.standing.certain:
+            futures = {Rival.of(ssh_map, mapper.trace, mapper.theory).future() for ssh_map in solution.maps}
+            assert len(futures) == 1
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(st.data())
+def test_what_is_known_of_steps_and_places_is_obeyed(data: st.DataObject) -> None:
+    """Pairs of steps that somebody asserts, and places with stars, are more than the two causal axioms: the maps are those of solving anew, too."""
+    trace = data.draw(small_traces(max_steps=5))
+    prices = {"misread": data.draw(st.sampled_from([0.0, 0.4, 1.0])), "slipped": data.draw(st.sampled_from([0.3, 1.0]))}
+    if data.draw(st.booleans(), label="places"):
+        stars = data.draw(st.lists(st.sampled_from([(1, 0, 0, 0), (1, 1, 0, 0)]), min_size=len(trace), max_size=len(trace)))
+        trace = Trace.from_steps(trace.views, [action.name for action in trace.actions], stars=stars)
+        theory = Theory(**prices, star="frame")
+    else:
+        pairs = [pair for pair in [(0, 2), (1, 3)] if max(pair) < len(trace)]
+        theory = Theory.causal().replace(**prices, **{data.draw(st.sampled_from(["same", "different"])): pairs})
+    for _, solution in followed(trace, theory):
+        anew = solve(trace.prefix(solution.steps), theory.of_steps(0, solution.steps), maps=0)
+        assert (solution.status, solution.complete) == (anew.status, True)
+        assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
+        assert len(solution.maps) == len(anew.maps)
+
+
+def test_a_theory_without_an_axiom_is_solved_anew() -> None:
+    theory = Theory.causal().replace(misread=0.4, without=("deterministic",))
+    for _, solution in followed(Trace.from_steps("abaabb", ["travel"] * 5), theory):
+        anew = solve(Trace.from_steps("abaabb", ["travel"] * 5).prefix(solution.steps), theory, maps=0)
+        assert (solution.status, solution.complete) == (anew.status, True)
+        assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
+
+
+def test_a_wrong_view_is_told_and_excused() -> None:
+    for mapper, solution in followed(circuit(30, wrong=17), BOTH):
+        t, standing = solution.steps - 1, mapper.standing
+        assert sum(hypothesis.weight for hypothesis in standing.hypotheses) == pytest.approx(1)
+        assert standing.certain == (t != 17)
+        if t == 17:
+            assert standing.broke == ("step 17: seen v3, expected v1 at dstate 1: misread, slipped, or the map is wrong",)
+            assert [h.said for h in standing.hypotheses] == [
+                "the view at step 17 is misread: v3, expected v1; the robot is at dstate 1 of 4",
+                "the action at step 16 slipped: right; the robot is at dstate 3 of 4",
+            ]
+            assert isinstance(standing.where, Belief)
+            assert str(standing).startswith("uncertain, most likely: the view at step 17 is misread")
+        else:
+            assert standing.broke == (() if t != 18 else standing.broke[:1])
+    assert [str(fault) for fault in solution.maps[0].faults] == ["the view at step 17 is misread: v3, expected v1"]
+    assert mapper.searches < 6  # what is predicted is replayed
+
+
+@pytest.mark.parametrize("fault", ["wrong", "jumps"])
+def test_a_robot_is_certain_again_and_right(fault: str) -> None:
+    record = bench.run(rectangle_of_five(0, steps=60, **{fault: 1}), BOTH, limit=5)
+    assert (record["noticed"], record["right_again"], record["right"], record["found"]) == (0, True, True, [True])
+
+
+def test_a_star_that_is_misread_is_told() -> None:
+    stars = [(1, 0, 0, 0), (0, 0, 1, 0)] * 7
+    stars[6] = (1, 1, 0, 0)
+    trace = Trace.from_steps("abcd" * 3 + "ab", (["travel", "around"] * 7)[:13], stars=stars)
+    certain = []
+    for mapper, solution in followed(trace, Theory(misread=1.5, star="frame")):
+        certain.append(mapper.standing.certain)
+        if solution.steps == 7:
+            assert mapper.standing.broke == ("step 6: seen another star than expected at dstate 2: misread, or the map is wrong",)
+    assert certain.index(False) == 6
+    assert certain[-1]
+    assert [str(fault) for fault in solution.maps[0].faults] == ["the star at step 6 is misread"]
+
+
+def test_without_time_there_is_a_map_and_a_belief() -> None:
+    """Every search is stopped at once: the belief goes on by itself, and what it says is consistent, with a bound, but never certain."""
+    trace, alone = circuit(30, wrong=17), Speedups.without("processes")
+    for mapper, solution in followed(trace, BOTH, NO_TIME, speedups=alone):
+        assert solution.status is Status.FEASIBLE
+        assert solution.cost is not None
+        assert (solution.bound.tenths or 0) <= solution.cost.tenths
+        assert check(mapper.trace, solution.maps[0], BOTH) == ()
+        assert not mapper.standing.certain
+        assert sum(hypothesis.weight for hypothesis in mapper.standing.hypotheses) == pytest.approx(1)
+    assert mapper._recovery is not None
+    assert mapper._recovery._meanwhile is None
+
+
+def one_of_the_maps(trace: Trace, theory: Theory, limit: float | None, maps: int, speedups: Speedups) -> recovery.Solved:
+    """As if there were time to prove one map minimal, but not to list all."""
+    found = solve(trace, theory, maps=0)
+    return recovery.Solved(len(trace), found.status, found.maps[-1:], found.bound, complete=False, stopped="time limit")
+
+
+@pytest.mark.parametrize("in_a_step", [recovery.solved, one_of_the_maps])
+def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(in_a_step: Callable[..., recovery.Solved]) -> None:
+    """A second process is stood in for by what it would find, of steps that have been outgrown by then."""
+    trace, solved = circuit(30, wrong=17), recovery.solved
+    begun = []
+
+    def begin(now: Trace, theory: Theory, maps: int, speedups: Speedups) -> Meanwhile:
+        found = solved(now, theory, None, maps, speedups)
+        begun.append(len(now))
+        ends = len(now) + 3
+
+        class Stub:
+            def done(self) -> bool:
+                return mapper is None or len(mapper.trace) >= ends
+
+            def result(self) -> recovery.Solved:
+                return found
+
+        return Stub()  # type: ignore[return-value]
+
+    mapper = None
+    with patch.object(Meanwhile, "begun", begin), patch.object(recovery, "solved", in_a_step):
+        for mapper, solution in followed(trace, BOTH, NO_TIME):  # noqa: B007
+            pass
+    assert begun
+    assert solution.status is Status.OPTIMAL
+    assert solution.complete
+    assert mapper is not None
+    assert mapper.standing.certain
+    assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in solve(trace, BOTH, maps=0).maps}
+
+
+class Busy:
+    """A second process that is never done."""
+
+    def done(self) -> bool:
+        return False
+
+
+def test_where_clingo_cannot_be_stopped_in_time_steps_do_not_wait_for_it_again() -> None:
+    with patch.object(Meanwhile, "begun", lambda *told: Busy()), patch.object(recovery, "OVERRUN", 0):
+        answers = list(followed(circuit(30, wrong=17), BOTH, NO_TIME))
+    assert {solution.status for _, solution in answers} == {Status.FEASIBLE}
+    assert answers[-1][0].searches == 1
+
+
+def test_a_process_of_its_own_solves_the_trace() -> None:
+    trace = circuit(20, wrong=17)
+    meanwhile = Meanwhile(trace, BOTH, 0, Speedups())
+    found = meanwhile.result()
+    assert meanwhile.done()
+    assert found is not None
+    assert (found.status, found.complete, found.steps) == (Status.OPTIMAL, True, 21)
+    assert found.maps == solve(trace, BOTH, maps=0).maps
+    ended = Meanwhile(circuit(2000, wrong=17), BOTH, 0, Speedups())
+    del ended  # and with it the process
+    assert not _under_way
+
+
+def test_displacements_that_come_later_are_used() -> None:
+    """Maps are sought anew where the trace settles the theory anew."""
+    mapper = OnlineMapper("corner", Theory.causal().replace(misread=1.5), odometry={"along": 0.02}, limit=None)
+    mapper.observe("travel", "wall")
+    for _ in range(4):
+        mapper.observe("left", "corner", displacement=(0.0, 0.0, 1.5708))
+        solution = mapper.observe("travel", "wall", displacement=(10.0, 0.0, 0.0))
+    anew = solve(mapper.trace, mapper.theory, maps=0)
+    assert mapper.theory.displacement == "use"
+    assert solution.status is Status.OPTIMAL
+    assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
+
+
+def test_what_is_decided_is_what_will_be() -> None:
+    """Two actions in a row, one of which slipped: which one it was nothing tells, and the map is certain."""
+    for seed in range(40):
+        for mapper, solution in followed(bench.machine(seed, jumps=1).walk.trace.prefix(60), Theory.causal().replace(slipped=1.5), 1, 100):
+            if mapper.standing.certain and len({m.faults for m in solution.maps}) > 1:
+                rivals = [Rival.of(m, mapper.trace, mapper.theory) for m in solution.maps]
+                assert len({rival.future() for rival in rivals}) == 1
+                assert len({rival.labels for rival in rivals}) > 1
+                return
+    pytest.fail("expected a trace whose maps differ in the step that slipped")
+
+
+def test_rivals_are_weighed_by_faults_and_by_what_they_assume() -> None:
+    trace = circuit(16)
+    theory = Theory.causal().replace(misread=1.5, slipped=3)
+    lead = Rival.of(solve(trace, theory).maps[0], trace, theory)
+    step = trace.steps[1]
+    wrong, slipped, new = lead.ways_on("right", replace(step, view="v2"), ("v2", None), theory)
+    assert [rival.cost[0] for rival in (lead, wrong, slipped, new)] == [40, 55, 70, 80]
+    shares = Scale.of(theory, 0.01, dstates=4, views=4).shares([wrong, slipped, new])
+    assert shares[1] == pytest.approx(0.01 * shares[0])  # twice the price, and as many dstates as views
+    assert sum(shares) == pytest.approx(1)
+    again = next(new.ways_on("travel", step, ("v3", None), theory))
+    shares = Scale.of(theory, 0.01, dstates=4, views=4).shares([new, again])
+    assert shares[1] == pytest.approx(shares[0] / 4)  # a link more, to one of four dstates
+
+
+def test_what_does_not_fit_is_refused_and_changes_nothing() -> None:
+    mapper = OnlineMapper("v0", BOTH)
+    before = mapper.observe("right", "v1")
+    with pytest.raises(TraceError, match="action"):
+        mapper.observe({"name": "right", "kind": "travel"}, "v2")
+    assert mapper.solution is before
+    assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
+    with pytest.raises(TheoryError, match="expected faults"):
+        _ = OnlineMapper("v0", Theory.causal()).standing
+
+
+def test_weights_sum_to_one_and_ties_are_told() -> None:
+    """Both kinds at one price: which it was is not known at first, nor said."""
+    walk = [mapper.standing for mapper, _ in followed(circuit(18, wrong=17), Theory.causal().replace(misread=1.5, slipped=1.5))]
+    assert all(first.weight >= second.weight for standing in walk for first, second in pairwise(standing.hypotheses[:-1]))
+    assert {h.said.partition(":")[0] for h in walk[17].hypotheses} >= {"the view at step 17 is misread", "the action at step 16 slipped"}
+    assert not walk[17].certain
