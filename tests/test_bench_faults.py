@@ -89,7 +89,7 @@ def test_a_row_of_the_table() -> None:
     tie = {**common, "seed": 1, "status": "ok", "cpu": 2.0, "right": False, "found": 1, "tenths": 80}
     cheaper = {**tie, "seed": 2, "status": "timeout", "proven": False, "among": False, "found": 0, "tenths": 75}
     row = faults.table([right, tie, cheaper, {**cheaper, "solver": "RC2", "status": "not installed"}]).splitlines()[-2:]
-    assert row[0] == f"| {family} | ssh-abduction | 1 of 3 | 2 of 3 | 2 of 3 | 3 of 6 | 3 | 2.00 | > 9 | 1 cheaper, 1 as cheap |"
+    assert row[0] == f"| {family} | ssh-abduction | 1 of 3 | 2 of 3 | 2 of 3 | 3 of 6 | 3 | 0.000 | 2.00 | > 9 | 1 cheaper, 1 as cheap |"
     assert row[1].startswith(f"| {family} | RC2 | not installed | – |")
     assert faults.contradictions([right, tie, cheaper]) == []
     assert len(faults.contradictions([{**right, "tenths": 90}])) == 1

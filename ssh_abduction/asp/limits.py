@@ -20,7 +20,7 @@ POLL = 0.05
 # Seconds between two reports of progress: as often as somebody can read them.
 TICK = 0.5
 
-Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit"]
+Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit", "no proof"]
 
 
 def check_limit(name: str, unit: str, limit: object) -> None:

@@ -18,7 +18,7 @@ from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.theory import COUNTS, Theory
 
 STATUSES = ("optimal", "feasible", "unsatisfiable", "unknown")
-REASONS = ("time limit", "memory limit", "interrupted", "maps limit")  # why a search may have been stopped
+REASONS = ("time limit", "memory limit", "interrupted", "maps limit", "no proof")  # why a search may have been stopped
 
 
 def false_claims(answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int) -> tuple[str, ...]:

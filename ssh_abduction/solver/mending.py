@@ -48,6 +48,7 @@ class Mending:
             Trace, tuple[Found | None, bool]
         ] = {}  # a minimal map of each mended trace, and whether it is known to be minimal
         self._best: Found | None = None
+        self._cheapest: list[Trace] = []  # what all causal maps mend that cost the least, once these are known
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
         # The log is that of the theory: so stars tell dstates apart, and so do pairs of steps that are not at one place.
         self._causal = FaultyEngine(replace(Task.of(task.trace, causal, task.watch), log=task.log))
@@ -66,18 +67,17 @@ class Mending:
         yield from self._by_merging()
         for mended in self._by_causal_maps():
             yield from self._improving(self._minimal(mended)[0])
+        for mended in self._by_cheapest_causal_maps():
+            yield from self._improving(self._minimal(mended)[0])
 
     def minimal_maps(self, most: int) -> tuple[SSHMap, ...] | None:
-        """The minimal maps, once the causal theory shows that none is cheaper than the best one; None where it does not, or where some may be missing.
+        """The minimal maps, once `maps` has ended, where no causal map is cheaper than the best one; None where one is, or where some may be missing.
 
         most  list so many of each mended trace at most; 0 for all
         """
-        if self._best is None or self.bound is None or self._best.cost[0] > self.bound:
+        if self._best is None or self._best.cost[0] != self.bound or not self._cheapest:
             return None
-        causal = list(self._causal.maps_of_cost((self.bound,), MOST_CAUSAL))
-        if len(causal) == MOST_CAUSAL:
-            return None
-        solved = {mended: self._minimal(mended) for mended in dict.fromkeys(self._mended(found.map) for found in causal)}
+        solved = {mended: self._minimal(mended) for mended in self._cheapest}
         if not all(proven for _, proven in solved.values()):
             return None
         costs = {mended: found.cost for mended, (found, _) in solved.items() if found is not None}
@@ -121,6 +121,18 @@ class Mending:
         self._causal.grow(len(self._task.trace))
         for found in self._causal.improving_maps():
             yield self._mended(found.map)
+
+    def _by_cheapest_causal_maps(self) -> Iterator[Trace]:
+        """What the causal maps mend that cost the least: the faults of some may have smaller maps with places than those of others."""
+        causal: list[SSHMap] = []
+        found: dict[Trace, None] = {}
+        for cheapest in self._causal.maps_of_cost((self.bound or 0,), MOST_CAUSAL):
+            causal.append(cheapest.map)
+            mended = self._mended(cheapest.map)
+            if mended not in found:
+                found[mended] = None
+                yield mended
+        self._cheapest = list(found) if len(causal) < MOST_CAUSAL else []
 
     def _mended(self, causal: SSHMap) -> Trace:
         """The trace with what a causal map disbelieves replaced: by what was seen at another step at the same dstate, or by an action of which nothing is known."""

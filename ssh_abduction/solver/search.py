@@ -74,6 +74,7 @@ FEW_STEPS = 24  # Traces up to this length skip names and greedy maps: solving t
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.
 ONE_MORE_SHARE = 0.1  # Or for such a share of the time that these took, if that is more, so that it is never a large part of the search.
 FRAME_AFTER = 1.0  # After so many seconds step by step a map with frames is sought, where the theory does not ask for one: most traces are solved by then.
+READABLE = 60  # Traces up to so many steps are given to the readable encodings, which know places and faults; longer ones would take more memory than there is.
 SHORTEST = 0.05  # A trace that was mended has so many seconds at least.
 REASONING = 5.0  # For so many seconds it is sought what all minimal maps share, where the search took less and has no time limit.
 ALL = Speedups()
@@ -335,6 +336,8 @@ class Search:
         engine, steps = self._prefixes.engine, len(self.trace)
         if row("mending").holds_for(self.theory) and self._may_name() and self._mend():
             return
+        if self._mends and len(self.trace) > READABLE:
+            raise LimitError("no proof")
         if self.status is Status.OPTIMAL:  # a map that another search proved
             if not engine.size:
                 engine.grow(steps if engine.lists_least else min(steps, prefixes.FIRST_PREFIX))
