@@ -100,7 +100,7 @@ LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = 
     ),
     "no such reason to stop": (
         {"complete": False, "stopped": "lunch"},
-        "stopped: expected one of time limit, memory limit, interrupted, maps limit, got 'lunch'",
+        "stopped: expected one of time limit, memory limit, interrupted, maps limit, no proof, got 'lunch'",
     ),
     "no such status": ({"status": "perfect"}, "status: expected one of optimal, feasible, unsatisfiable, unknown, got 'perfect'"),
     "a status of another type": ({"status": [1]}, "status: expected one of optimal, feasible, unsatisfiable, unknown, got [1]"),
