@@ -32,6 +32,8 @@ MOST_CAUSAL = 200
 ROUNDS = 5
 # For so many seconds a better map is sought of what merging mends, and for such a share of the time that is left at most.
 MERGED, SHARE = 30.0, 0.5
+# A dstate that is visited so many times or less is rare; one of so many actions before it may have slipped; so many actions are suspected at most.
+RARE, BEFORE, SUSPECTED = 1, 3, 60
 
 # Solves a mended trace by a theory without faults, and lists so many maps at most (0: all): its minimal maps, and True; or the best one known, and False.
 # The last argument are the seconds that it may take.
@@ -48,6 +50,7 @@ class Mending:
             Trace, tuple[Found | None, bool]
         ] = {}  # a minimal map of each mended trace, and whether it is known to be minimal
         self._best: Found | None = None
+        self._best_mended: Trace | None = None
         self._cheapest: list[Trace] = []  # what all causal maps mend that cost the least, once these are known
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
         # The log is that of the theory: so stars tell dstates apart, and so do pairs of steps that are not at one place.
@@ -66,9 +69,10 @@ class Mending:
         """Maps of the whole trace, each better than the one before."""
         yield from self._by_merging()
         for mended in self._by_causal_maps():
-            yield from self._improving(self._minimal(mended)[0])
+            yield from self._improving(self._minimal(mended)[0], mended)
         for mended in self._by_cheapest_causal_maps():
-            yield from self._improving(self._minimal(mended)[0])
+            yield from self._improving(self._minimal(mended)[0], mended)
+        yield from self._by_rare_dstates()
 
     def minimal_maps(self, most: int) -> tuple[SSHMap, ...] | None:
         """The minimal maps, once `maps` has ended, where no causal map is cheaper than the best one; None where one is, or where some may be missing.
@@ -86,10 +90,10 @@ class Mending:
         listed = (self._as_found(ssh_map, mended).map for mended in minimal for ssh_map in self._maps_of(mended, most)[0])
         return tuple(dict.fromkeys(listed))
 
-    def _improving(self, better: Found | None) -> Iterator[Found]:
-        """A map, if it is better than the best one so far."""
+    def _improving(self, better: Found | None, mended: Trace) -> Iterator[Found]:
+        """A map of a mended trace, if it is better than the best one so far."""
         if better is not None and (self._best is None or better.cost < self._best.cost):
-            self._best = better
+            self._best, self._best_mended = better, mended
             yield better
 
     def _by_merging(self) -> Iterator[Found]:
@@ -110,8 +114,8 @@ class Mending:
             task = Task.of(mended, self._without_faults, self._task.watch, self._task.speedups)
             near = FramedEngine(task).map_mended_from(merging.labels()) if _has_frames(task) else None
             if near is not None:
-                yield from self._improving(self._as_found(near.map, mended))
-            yield from self._improving(self._minimal(mended, MERGED)[0])
+                yield from self._improving(self._as_found(near.map, mended), mended)
+            yield from self._improving(self._minimal(mended, MERGED)[0], mended)
             if self._best is before:
                 return
             before = self._best
@@ -133,6 +137,25 @@ class Mending:
                 found[mended] = None
                 yield mended
         self._cheapest = list(found) if len(causal) < MOST_CAUSAL else []
+
+    def _by_rare_dstates(self) -> Iterator[Found]:
+        """Maps in which an action slipped shortly before a dstate that is hardly ever visited, while that gives better ones.
+
+        The causal theory does not see each slip: what it takes for one more link may break a path. Then the places behind it come out as new ones.
+        """
+        before: Found | None = None
+        while self._task.theory.slipped and self._best is not before:
+            before, mended = self._best, self._best_mended
+            if before is None or mended is None or before.cost[0] == self.bound:
+                return
+            visits = Counter(before.map.labels)
+            rare = [t for t, label in enumerate(before.map.labels) if visits[label] <= RARE]
+            suspected = dict.fromkeys(k for t in rare for k in range(t - 1, t - 1 - BEFORE, -1) if k >= 0)
+            for k in list(suspected)[:SUSPECTED]:
+                steps = list(mended.steps)
+                steps[k] = replace(steps[k], action=Action.that_slipped(k))
+                slipped = replace(mended, steps=tuple(steps))
+                yield from self._improving(self._minimal(slipped)[0], slipped)
 
     def _mended(self, causal: SSHMap) -> Trace:
         """The trace with what a causal map disbelieves replaced: by what was seen at another step at the same dstate, or by an action of which nothing is known."""
