@@ -572,6 +572,12 @@ def at_most_faults(most: int) -> str:
     return f":- #count {{ T,misread : misreads(T); T,slipped : slips(T) }} > {most}."
 
 
+def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
+    """That there are so many dstates at most, and that their faults cost no more than this, as rules for faulty.lp."""
+    faults = "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
+    return f"#program more(b).\n:- #sum {{ {faults} }} > {tenths}.\n:- #count {{ S : used(S) }} > {dstates}."
+
+
 def faulty_base(actions: Iterable[int], names: Mapping[int, int], kinds: Iterable[str]) -> str:
     """The names of dstates, the actions, and the kinds of faults that may be, as facts for faulty.lp.
 

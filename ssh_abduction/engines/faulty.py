@@ -23,9 +23,12 @@ import clingo
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker, Control
 from ssh_abduction.engines.base import Found, Task
+from ssh_abduction.engines.blocks import Blocks
 from ssh_abduction.guesses.robust import Explained, Explainer, Machine, robust_maps
+from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.evidence import Equality
 
+LONG = 1000  # A trace of so many steps is bounded by blocks of it before clingo is asked.
 AT_FIRST = 80  # The first steps of the trace, which clingo is given at once.
 AROUND = 8  # So many steps before and behind one that a map does not predict are given.
 PLACES = 12  # Steps around so many of those that the Viterbi pass disbelieves are given at once.
@@ -84,6 +87,7 @@ class FaultyEngine:
         self._given: set[int] = set()
         self._full: set[int] = set()
         self._best: int | None = None  # tenths of dstates that the best map costs that is known
+        self._known: SSHMap | None = None  # this map
         self._explainer = Explainer(self._seen, self._actions, self._price, task.watch.check)
         self._forbidden: list[Collection[Equality]] = []
         # What clingo was told: the names of views and the steps that are full, the steps in the order in which they were given, in how many batches, and how many of the forbidden sets.
@@ -114,10 +118,11 @@ class FaultyEngine:
                 self._full |= {t, *others}  # so that none evades it
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
-        best: int | None = None
+        best = self._best = self._known = None
         for found in chain(self._guessed(), self._asked()):
             if best is None or self._cost_of(found) < best:
                 best = self._best = self._cost_of(found)
+                self._known = found.map
                 yield found
                 if best <= (self.bound or 0):
                     return
@@ -138,9 +143,17 @@ class FaultyEngine:
             if watch.elapsed() - began > may_take:
                 return
 
+    def _bound_by_blocks(self) -> None:
+        """Raise the bound of a long trace by disjoint blocks of it."""
+        if self.size >= LONG and self._known is not None and self._most_faults is None:
+            faults = {kind: [fault.step for fault in self._known.faults if fault.kind == kind] for kind in self._price}
+            blocks = Blocks(self._seen, self._actions, self._price, faults, len(self._known.dstates), self._task.watch)
+            self._raise_bound([blocks.bound()])
+
     def _asked(self) -> Iterator[Found]:
         """Maps of the whole trace by which clingo's answers for the given steps explain it. Where the iteration ends, the best one is minimal."""
-        while True:
+        self._bound_by_blocks()
+        while self._best is None or self._best > (self.bound or 0):
             answer = None
             for answer in self._answers(f"opt,{self._best - 1}" if self._best else "opt"):
                 explained, doubted = self._explained(answer)
@@ -154,8 +167,6 @@ class FaultyEngine:
             if labels is not None:
                 yield self._found(labels, answer.slips, self._machine(answer)[0])
                 return
-            if self._best is not None and self._best <= self.bound:
-                return
             if answer.rests:
                 self._name_more(answer)
             self._full |= answer.lost
@@ -166,6 +177,10 @@ class FaultyEngine:
         return found.cost[0] if self._most_faults is None else 10 * len(found.map.dstates)
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
+        given = set()
+        if self._known is not None and self._best == cost[0]:
+            given.add(self._known)
+            yield Found.of(self._known, self._task.theory)
         while True:
             found: list[Found] = []
             for answer in self._answers_of_cost(cost[0], enough):
@@ -174,7 +189,7 @@ class FaultyEngine:
                     break
                 found.append(self._found(labels, answer.slips, self._machine(answer)[0]))
             else:
-                yield from found
+                yield from (one for one in found if one.map not in given)
                 return
             if answer.rests:
                 self._name_more(answer)
@@ -309,6 +324,8 @@ class FaultyEngine:
         if (explained.misread and "misread" not in self._price) or (explained.slips and "slipped" not in self._price):
             return None
         if set(labels) - {s for t, s in enumerate(labels) if shows[s] == self._seen[t]}:  # a dstate whose view is never read right
+            return None
+        if any(all(labels[one.first] == labels[one.second] for one in together) for together in self._forbidden):
             return None
         if self._task.log.pairs.broken_by(labels) or (self._most_faults is not None and len(explained.faults) > self._most_faults):
             return None

@@ -9,7 +9,7 @@ gets cheaper. In between, dstates are merged that can be one, and dropped where 
 >>> seen[30] = 0
 >>> explainer = Explainer(seen, [0] * 59, {"misread": [15] * 60})
 >>> guess = next(filter(None, robust_maps(explainer)))
->>> len(guess.machine.shows), guess.misread, guess.slips, guess.tenths
+>>> len(set(guess.labels)), guess.misread, guess.slips, guess.tenths
 (4, (30,), (), 55)
 """
 
