@@ -105,7 +105,10 @@ def test_causal_maps_with_faults_are_those_of_brute_force(trace: Trace, misread:
 def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) -> None:
     trace = data.draw(small_traces(max_steps=7))
     theory = Theory.causal().replace(misread=data.draw(st.sampled_from([0.0, 0.4, 1.0])), slipped=data.draw(st.sampled_from([0.3, 1.0])))
-    with patch.multiple(faulty, AT_FIRST=2, AROUND=0, PLACES=1, NAMES=1, MORE_NAMES=1), patch.object(search, "FEW_STEPS", 0):
+    with (
+        patch.multiple(faulty, FEW=data.draw(st.sampled_from([2, 9])), AT_FIRST=2, AROUND=0, PLACES=1, NAMES=1, MORE_NAMES=1),
+        patch.object(search, "FEW_STEPS", 0),
+    ):
         solution = solve(trace, theory, maps=0)
     cost, expected = cheapest(trace, round(10 * theory.misread), round(10 * theory.slipped))
     assert solution.cost is not None

@@ -5,7 +5,10 @@ A map of the given steps is followed through the others. Where it predicts all t
 so it is minimal. Where it does not, the steps around are given, too.
 
 Which steps these are a Viterbi pass tells: it finds the fewest faults by which the map explains the whole trace (Viterbi 1967). That is a map of the whole trace, too, and
-the best answer so far.
+the best answer so far. The first such maps are guessed (`guesses/robust.py`), and clingo is only asked for cheaper ones. A long trace is bounded by blocks of it (`engines/blocks.py`).
+
+Where a misread step is, clingo is not asked at first: it is *lost*, and nothing links it with others, which forbids less. Only where a minimal answer loses a step that step
+is *full*: it may be at any dstate. Else each link would join all names with all.
 
 Dstates have names, as many for each view as are needed, and a rest: a name for all others of the view. A rest costs one dstate, and nothing is asked of the steps there.
 So a minimum in which no rest is used is one for any number of names; where one is used, its view is given more names.
@@ -29,13 +32,16 @@ from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.evidence import Equality
 
 LONG = 1000  # A trace of so many steps is bounded by blocks of it before clingo is asked.
-AT_FIRST = 80  # The first steps of the trace, which clingo is given at once.
+FEW = 80  # For so few steps no map is guessed: clingo is as soon done.
+AT_FIRST = 1000  # The first steps of the trace, which clingo is given at once.
 AROUND = 8  # So many steps before and behind one that a map does not predict are given.
 PLACES = 12  # Steps around so many of those that the Viterbi pass disbelieves are given at once.
 NAMES = 3  # So many names a view has at first.
 MORE_NAMES = 2  # So many more it is given where its rest is used.
 OPTIONS = ("--opt-strategy=usc,stratify",)
-SPARE = 1  # So many names a view has at first beside those of the best map that is guessed.
+SPARE = (
+    3  # So many names a view has at first beside those of the best map that is guessed. With one the rests are used, and all begins anew.
+)
 GUESSING = 5.0  # No start of EM begins after so many seconds,
 GUESSING_SHARE = 0.1  # or after such a share of the time that is left.
 
@@ -129,7 +135,7 @@ class FaultyEngine:
 
     def _guessed(self) -> Iterator[Found]:
         """Maps of the whole trace that nothing proves. What is known of the best of them clingo is told: how many names views need, and what is disbelieved."""
-        if self.size <= AT_FIRST or self._task.log.pairs.one:
+        if self.size <= FEW or self._task.log.pairs.one:
             return
         watch = self._task.watch
         began, may_take = watch.elapsed(), min(GUESSING, GUESSING_SHARE * watch.left())
