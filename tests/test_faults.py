@@ -7,7 +7,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import pairwise, product
+from itertools import accumulate, pairwise, product
 from pathlib import Path
 from unittest.mock import patch
 
@@ -20,8 +20,11 @@ from instances import faulty_machine
 from ssh_abduction import Speedups, Status, Step, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.engines import faulty
+from ssh_abduction.engines.base import Task
+from ssh_abduction.engines.blocks import Blocks
 from ssh_abduction.errors import MapError, TheoryError
 from ssh_abduction.front import fault_front
+from ssh_abduction.guesses.robust import Explainer
 from ssh_abduction.judge.checker import check
 from ssh_abduction.maps import Fault, SSHMap
 from ssh_abduction.solver import search
@@ -102,7 +105,10 @@ def test_causal_maps_with_faults_are_those_of_brute_force(trace: Trace, misread:
 def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) -> None:
     trace = data.draw(small_traces(max_steps=7))
     theory = Theory.causal().replace(misread=data.draw(st.sampled_from([0.0, 0.4, 1.0])), slipped=data.draw(st.sampled_from([0.3, 1.0])))
-    with patch.multiple(faulty, AT_FIRST=2, AROUND=0, PLACES=1, NAMES=1, MORE_NAMES=1), patch.object(search, "FEW_STEPS", 0):
+    with (
+        patch.multiple(faulty, FEW=data.draw(st.sampled_from([2, 9])), AT_FIRST=2, AROUND=0, PLACES=1, NAMES=1, MORE_NAMES=1),
+        patch.object(search, "FEW_STEPS", 0),
+    ):
         solution = solve(trace, theory, maps=0)
     cost, expected = cheapest(trace, round(10 * theory.misread), round(10 * theory.slipped))
     assert solution.cost is not None
@@ -147,6 +153,39 @@ def test_the_faults_of_machines_are_found(seed: int) -> None:
     assert solution.cost is not None
     assert (solution.cost.dstates, solution.cost.faults) == (6, 1.5)
     assert any([fault.step for fault in ssh_map.faults] == [*wrong, *jumps] for ssh_map in solution.maps)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.data())
+def test_bounds_by_blocks_are_no_more_than_the_minimum(data: st.DataObject) -> None:
+    """Whatever map is known: here one dstate for each view, or one for each step, and all that disagrees is a fault."""
+    trace = data.draw(small_traces(max_steps=7))
+    theory = Theory.causal().replace(misread=data.draw(st.sampled_from([0.4, 1.0])), slipped=data.draw(st.sampled_from([0.3, 1.0])))
+    task = Task.of(trace, theory)
+    price = {kind: [theory.fault_tenths(kind, step) for step in trace.steps] for kind in ("misread", "slipped")}
+    machine = Explainer(task.log.seen, task.log.actions, price).read_off(data.draw(st.sampled_from([task.log.seen, range(len(trace))])))
+    known = Explainer(task.log.seen, task.log.actions, price).completed(machine)
+    faults = {"misread": known.misread, "slipped": known.slips}
+    blocks = Blocks(task.log.seen, task.log.actions, price, faults, len(set(known.labels)), task.watch)
+    cost, _ = cheapest(trace, round(10 * theory.misread), round(10 * theory.slipped))
+    assert cost is not None
+    assert blocks.bound() <= cost <= known.tenths == blocks.cost
+    assert all(blocks.least_faults(most) <= known.tenths for most in range(len(set(known.labels)), 8))
+
+
+@pytest.mark.parametrize("kind", ["misread", "slipped"])
+def test_many_faults_of_a_long_trace_are_proven(kind: str) -> None:
+    """A rectangle of eight dstates and five views, 1,200 steps, and twelve faults: disjoint blocks add up to what the map costs."""
+    wrong = range(60, 1200, 100)
+    at = list(accumulate((3 if kind == "slipped" and t in wrong else 1 for t in range(1, 1200)), initial=0))
+    seen = ["v4" if s % 8 == 4 else f"v{s % 4}" for s in at]
+    for t in wrong if kind == "misread" else ():
+        seen[t] = "v3" if seen[t] != "v3" else "v2"
+    trace = Trace.from_steps(seen, ["right", "travel"] * 599 + ["right"])
+    solution = solve(trace, Theory.causal().replace(**{kind: 1.5}), maps=1)
+    assert solution.status is Status.OPTIMAL
+    assert solution.cost is not None
+    assert (solution.cost.dstates, len(solution.maps[0].faults)) == (8, 12)
 
 
 def test_a_star_that_is_misread_is_excused() -> None:

@@ -573,6 +573,12 @@ def at_most_faults(most: int) -> str:
     return f":- #count {{ T,misread : misreads(T); T,slipped : slips(T) }} > {most}."
 
 
+def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
+    """That there are so many dstates at most, and that their faults cost no more than this, as rules for faulty.lp."""
+    faults = "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
+    return f"#program more(b).\n:- #sum {{ {faults} }} > {tenths}.\n:- #count {{ S : used(S) }} > {dstates}."
+
+
 def faulty_base(actions: Iterable[int], names: Mapping[int, int], kinds: Iterable[str]) -> str:
     """The names of dstates, the actions, and the kinds of faults that may be, as facts for faulty.lp.
 
@@ -596,9 +602,11 @@ def faulty_batch(
     known: Sequence[int],
     pairs: Pairs,
     price: Mapping[str, Sequence[int]],
+    full: Collection[int] = (),
 ) -> str:
     """These steps of a trace as a batch of facts for faulty.lp.
 
+    full   steps of which it is asked where they are, also where their views are misread
     price  tenths of dstates for each kind of fault that may be, at each step
     steps  in the order in which they are given
     known  those that were given before, in that order
@@ -606,6 +614,7 @@ def faulty_batch(
     given = {*known, *steps}
     new = set(steps)
     found = [f"node({batch},{t},{seen[t]})." for t in steps]
+    found += [f"full({t})." for t in steps if t in full]
     found += [f"next({batch},{t},{u})." for t, u in pairwise([*known[-1:], *steps])]
     links = sorted({t for step in steps for t in (step - 1, step) if t in given and t + 1 in given})
     found += [f"link({batch},{t},{actions[t]},{t + 1})." for t in links]
@@ -621,16 +630,16 @@ def not_all_one(equalities: Collection[Equality]) -> str:
     return f":- {', '.join(f'is({e.first},S{k}), is({e.second},S{k})' for k, e in enumerate(equalities))}."
 
 
-def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int]]:
-    """Where each given step is, by the names of faulty.lp, and the steps whose actions slipped."""
+def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int], frozenset[int]]:
+    """Where each given step is, by the names of faulty.lp; the steps whose actions slipped; and those that are lost, as nobody asks where they are."""
     where: dict[int, int] = {}
-    slips: set[int] = set()
+    steps: dict[str, set[int]] = {"slips": set(), "lost": set()}
     for name, args in map(_atom, model.symbols(shown=True)):
         if name == "is":
             where[args[0]] = args[1]
         else:
-            slips.add(args[0])
-    return where, frozenset(slips)
+            steps[name].add(args[0])
+    return where, frozenset(steps["slips"]), frozenset(steps["lost"])
 
 
 def paths_framed_facts(trace: Trace, theory: Theory, chart: FramedChart, forbidden: Sequence[Collection[Equality]] = ()) -> str:

@@ -5,7 +5,10 @@ A map of the given steps is followed through the others. Where it predicts all t
 so it is minimal. Where it does not, the steps around are given, too.
 
 Which steps these are a Viterbi pass tells: it finds the fewest faults by which the map explains the whole trace (Viterbi 1967). That is a map of the whole trace, too, and
-the best answer so far.
+the best answer so far. The first such maps are guessed (`guesses/robust.py`), and clingo is only asked for cheaper ones. A long trace is bounded by blocks of it (`engines/blocks.py`).
+
+Where a misread step is, clingo is not asked at first: it is *lost*, and nothing links it with others, which forbids less. Only where a minimal answer loses a step that step
+is *full*: it may be at any dstate. Else each link would join all names with all.
 
 Dstates have names, as many for each view as are needed, and a rest: a name for all others of the view. A rest costs one dstate, and nothing is asked of the steps there.
 So a minimum in which no rest is used is one for any number of names; where one is used, its view is given more names.
@@ -13,26 +16,34 @@ So a minimum in which no rest is used is one for any number of names; where one 
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import clingo
-import numpy as np
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker, Control
 from ssh_abduction.engines.base import Found, Task
+from ssh_abduction.engines.blocks import Blocks
+from ssh_abduction.guesses.robust import Explained, Explainer, Machine, robust_maps
+from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.evidence import Equality
 
-AT_FIRST = 80  # The first steps of the trace, which clingo is given at once.
+LONG = 1000  # A trace of so many steps is bounded by blocks of it before clingo is asked.
+FEW = 80  # For so few steps no map is guessed: clingo is as soon done.
+AT_FIRST = 1000  # The first steps of the trace, which clingo is given at once.
 AROUND = 8  # So many steps before and behind one that a map does not predict are given.
 PLACES = 12  # Steps around so many of those that the Viterbi pass disbelieves are given at once.
 NAMES = 3  # So many names a view has at first.
 MORE_NAMES = 2  # So many more it is given where its rest is used.
 OPTIONS = ("--opt-strategy=usc,stratify",)
-NEVER = 1_000_000  # What the Viterbi pass pays for faults of a kind that may not be.
-UNKNOWN = 0.5  # What the Viterbi pass pays, in tenths of dstates, where the map does not know where an action leads: less than any fault.
+SPARE = (
+    3  # So many names a view has at first beside those of the best map that is guessed. With one the rests are used, and all begins anew.
+)
+GUESSING = 5.0  # No start of EM begins after so many seconds,
+GUESSING_SHARE = 0.1  # or after such a share of the time that is left.
 
 
 @dataclass(frozen=True)
@@ -42,21 +53,15 @@ class _Answer:
     cost   tenths of dstates
     where  the name of the dstate of each given step
     slips  the given steps at which the action slipped
+    lost   the given steps whose views are misread, and of which it was not asked where they are
     rests  the views whose rest is used
     """
 
     cost: int
     where: Mapping[int, int]
     slips: frozenset[int]
+    lost: frozenset[int]
     rests: frozenset[int]
-
-
-@dataclass(frozen=True)
-class _Machine:
-    """The dstates of an answer, numbered from 0: the view of each, and where actions lead as far as given steps show."""
-
-    shows: Sequence[int]
-    goes: Mapping[tuple[int, int], int]
 
 
 class FaultyEngine:
@@ -86,9 +91,13 @@ class FaultyEngine:
         }
         self._names = dict.fromkeys(range(max(self._seen) + 1), NAMES)
         self._given: set[int] = set()
+        self._full: set[int] = set()
+        self._best: int | None = None  # tenths of dstates that the best map costs that is known
+        self._known: SSHMap | None = None  # this map
+        self._explainer = Explainer(self._seen, self._actions, self._price, task.watch.check)
         self._forbidden: list[Collection[Equality]] = []
-        # What clingo was told: the names of views, the steps in the order in which they were given, in how many batches, and how many of the forbidden sets.
-        self._named: dict[int, int] = {}
+        # What clingo was told: the names of views and the steps that are full, the steps in the order in which they were given, in how many batches, and how many of the forbidden sets.
+        self._named: tuple[dict[int, int], set[int]] = {}, set()
         self._told: list[int] = []
         self._batches = self._ruled = 0
 
@@ -112,47 +121,86 @@ class FaultyEngine:
             self._given = set(range(min(size, AT_FIRST)))
             for t, others in self._task.log.pairs.one.items():
                 self._given |= {t, *others}
+                self._full |= {t, *others}  # so that none evades it
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
-        best: int | None = None
-        while True:
-            answer = self._best_answer()
+        best = self._best = self._known = None
+        for found in chain(self._guessed(), self._asked()):
+            if best is None or self._cost_of(found) < best:
+                best = self._best = self._cost_of(found)
+                self._known = found.map
+                yield found
+                if best <= (self.bound or 0):
+                    return
+
+    def _guessed(self) -> Iterator[Found]:
+        """Maps of the whole trace that nothing proves. What is known of the best of them clingo is told: how many names views need, and what is disbelieved."""
+        if self.size <= FEW or self._task.log.pairs.one:
+            return
+        watch = self._task.watch
+        began, may_take = watch.elapsed(), min(GUESSING, GUESSING_SHARE * watch.left())
+        for guess in robust_maps(self._explainer):
+            found = None if guess is None else self._map_of(guess)
+            if guess is not None and found is not None:
+                used = Counter(guess.machine.shows[s] for s in set(guess.labels))
+                self._names = {view: used[view] + SPARE for view in self._names}
+                self._give(guess.faults)
+                yield found
+            if watch.elapsed() - began > may_take:
+                return
+
+    def _bound_by_blocks(self) -> None:
+        """Raise the bound of a long trace by disjoint blocks of it."""
+        if self.size >= LONG and self._known is not None and self._most_faults is None:
+            faults = {kind: [fault.step for fault in self._known.faults if fault.kind == kind] for kind in self._price}
+            blocks = Blocks(self._seen, self._actions, self._price, faults, len(self._known.dstates), self._task.watch)
+            self._raise_bound([blocks.bound()])
+
+    def _asked(self) -> Iterator[Found]:
+        """Maps of the whole trace by which clingo's answers for the given steps explain it. Where the iteration ends, the best one is minimal."""
+        self._bound_by_blocks()
+        while self._best is None or self._best > (self.bound or 0):
+            answer = None
+            for answer in self._answers(f"opt,{self._best - 1}" if self._best else "opt"):
+                explained, doubted = self._explained(answer)
+                if explained is not None:
+                    yield explained
             if answer is None:
+                self.bound = max(self.bound or 0, self._best or 0)
                 return
             self.bound = max(self.bound or 0, answer.cost)
-            if answer.rests:
-                self._name_more(answer)
-                continue
-            labels, failed = self._followed(answer)
+            labels, failed = (None, -1) if answer.rests or answer.lost else self._followed(answer)
             if labels is not None:
                 yield self._found(labels, answer.slips, self._machine(answer)[0])
                 return
-            explained, doubted = self._explained(answer)
-            if explained is not None and (best is None or self._cost_of(explained) < best):
-                best = self._cost_of(explained)
-                yield explained
-                if best <= self.bound:
-                    return
-            self._give([failed, *doubted])
+            if answer.rests:
+                self._name_more(answer)
+            self._full |= answer.lost
+            self._give([failed, *doubted] if failed >= 0 else doubted)
 
     def _cost_of(self, found: Found) -> int:
         """Tenths of dstates, as clingo counts them."""
         return found.cost[0] if self._most_faults is None else 10 * len(found.map.dstates)
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
+        given = set()
+        if self._known is not None and self._best == cost[0]:
+            given.add(self._known)
+            yield Found.of(self._known, self._task.theory)
         while True:
             found: list[Found] = []
             for answer in self._answers_of_cost(cost[0], enough):
-                labels, failed = (None, -1) if answer.rests else self._followed(answer)
+                labels, failed = (None, -1) if answer.rests or answer.lost else self._followed(answer)
                 if labels is None:
                     break
                 found.append(self._found(labels, answer.slips, self._machine(answer)[0]))
             else:
-                yield from found
+                yield from (one for one in found if one.map not in given)
                 return
             if answer.rests:
                 self._name_more(answer)
-            else:
+            self._full |= answer.lost
+            if failed >= 0:
                 self._give([failed])
 
     def labellings(self, cost: tuple[int, ...]) -> None:
@@ -180,8 +228,8 @@ class FaultyEngine:
     def _prepare(self) -> None:
         """Tell clingo of the given steps that it does not know yet; a new control where views have more names than it knows."""
         with self.asker.grounding_timed():
-            if self._named != self._names:
-                self._named, self._told = dict(self._names), []
+            if self._named != (self._names, self._full):
+                self._named, self._told = (dict(self._names), set(self._full)), []
                 self._batches = self._ruled = 0
                 self.asker.control = Control(OPTIONS, self.asker.watch.check)
                 self.asker.control.load_encodings("faulty")
@@ -191,7 +239,7 @@ class FaultyEngine:
             if new := sorted(self._given.difference(self._told)):
                 batch = self._batches
                 price = self._price if self._most_faults is None else {kind: [0] * len(self._seen) for kind in self._price}
-                told = facts.faulty_batch(batch, self._seen, self._actions, new, self._told, self._task.log.pairs, price)
+                told = facts.faulty_batch(batch, self._seen, self._actions, new, self._told, self._task.log.pairs, price, self._full)
                 control.add(f"batch_{batch}", [], told)
                 control.ground([(f"batch_{batch}", []), ("more", facts.numbers(batch))])
                 if self._most_faults is not None:
@@ -204,18 +252,21 @@ class FaultyEngine:
                 control.ground([(f"forbidden_{number}", [])])
             self._ruled = len(self._forbidden)
 
-    def _best_answer(self) -> _Answer | None:
-        """A minimal answer for the given steps."""
+    def _answers(self, mode: str) -> Iterator[_Answer]:
+        """Answers for the given steps, each cheaper than the one before; the last one is minimal."""
         self._prepare()
-        last = deque(self.asker.answers(self._read, "opt", 0), maxlen=1)
-        return last[0] if last else None
+        yield from self.asker.answers(self._read, mode, 0, on_bound=self._raise_bound)
+
+    def _raise_bound(self, bound: Sequence[int]) -> None:
+        """What clingo proved of the given steps holds of the whole trace."""
+        if bound and self._most_faults is None:
+            self.bound = max(self.bound or 0, bound[0])
 
     def _answers_of_cost(self, cost: int, enough: int) -> Iterator[_Answer]:
         """Answers for the given steps that cost so much, which is the least."""
         self._prepare()
-        minimal = (answer for answer in self.asker.answers(self._read, "optN", 0) if answer.cost == cost)
         seen: set[tuple[frozenset[tuple[int, int]], frozenset[int]]] = set()
-        for answer in minimal:  # the one that shows that there are no cheaper ones comes twice
+        for answer in self.asker.answers(self._read, f"enum,{cost}", 0):
             told = frozenset(answer.where.items()), answer.slips
             if told not in seen:
                 seen.add(told)
@@ -224,12 +275,12 @@ class FaultyEngine:
                     return
 
     def _read(self, model: clingo.Model) -> _Answer:
-        where, slips = facts.read_faulty(model)
+        where, slips, lost = facts.read_faulty(model)
         used = set(where.values())
         rests = frozenset(view for name, view in facts.faulty_rests(self._names) if name in used)
-        return _Answer(model.cost[0] if model.cost else 0, where, slips, rests)
+        return _Answer(model.cost[0] if model.cost else 0, where, slips, lost, rests)
 
-    def _machine(self, answer: _Answer) -> tuple[dict[int, int], _Machine]:
+    def _machine(self, answer: _Answer) -> tuple[dict[int, int], Machine]:
         """The number of each dstate that is named, by first visit, and what they are."""
         number: dict[int, int] = {}
         for t in sorted(answer.where):
@@ -240,7 +291,7 @@ class FaultyEngine:
             for t in answer.where
             if t + 1 in answer.where and t not in answer.slips
         }
-        return number, _Machine([view_of[name] for name in number], goes)
+        return number, Machine([view_of[name] for name in number], goes)
 
     def _followed(self, answer: _Answer) -> tuple[list[int] | None, int]:
         """The dstate of each step, by following the map of the given steps through all others; or None, and a step that is not given and not predicted."""
@@ -267,58 +318,24 @@ class FaultyEngine:
     def _explained(self, answer: _Answer) -> tuple[Found | None, list[int]]:
         """A map of the whole trace with the dstates of an answer and the fewest faults, and the first steps that are not given and are disbelieved, or not known."""
         _, machine = self._machine(answer)
-        goes = dict(machine.goes)
-        labels, unknown, faults = self._viterbi(machine.shows, goes)
-        doubted = [t for t in sorted({*unknown, *faults}) if t not in self._given]
-        while unknown:  # what is not known leads where it was taken to lead most often
-            votes: dict[tuple[int, int], Counter[int]] = {}
-            for t in unknown:
-                votes.setdefault((labels[t], self._actions[t]), Counter())[labels[t + 1]] += 1
-            goes |= {key: counts.most_common(1)[0][0] for key, counts in votes.items()}
-            labels, unknown, faults = self._viterbi(machine.shows, goes)
-            self.asker.watch.check()
-        return self._map_of(labels, machine.shows, goes), doubted[:PLACES]
+        if not machine.shows:  # all given steps are lost
+            return None, []
+        explained = self._explainer.explained(machine)
+        doubted = [t for t in sorted({*explained.unknown, *explained.faults}) if t not in self._given]
+        return self._map_of(self._explainer.completed(machine)), doubted[:PLACES]
 
-    def _map_of(self, labels: Sequence[int], shows: Sequence[int], goes: Mapping[tuple[int, int], int]) -> Found | None:
-        """The map of labels, whose faults are what the dstates and links do not say; None where faults of such a kind are not allowed."""
-        misread = [t for t in range(self.size) if shows[labels[t]] != self._seen[t]]
-        slips = frozenset(t for t in range(self.size - 1) if goes[labels[t], self._actions[t]] != labels[t + 1])
-        right = {labels[t] for t in range(self.size)} - {labels[t] for t in misread}
-        seen_right = right | {labels[t] for t in range(self.size) if shows[labels[t]] == self._seen[t]}
-        if (misread and "misread" not in self._price) or (slips and "slipped" not in self._price) or set(labels) - seen_right:
+    def _map_of(self, explained: Explained) -> Found | None:
+        """The map of an explanation of the trace; None where its faults are not allowed."""
+        labels, shows = explained.labels, explained.machine.shows
+        if (explained.misread and "misread" not in self._price) or (explained.slips and "slipped" not in self._price):
             return None
-        if self._task.log.pairs.broken_by(labels) or (self._most_faults is not None and len(misread) + len(slips) > self._most_faults):
+        if set(labels) - {s for t, s in enumerate(labels) if shows[s] == self._seen[t]}:  # a dstate whose view is never read right
             return None
-        return self._found(labels, slips, {}, shows)
-
-    def _viterbi(self, shows: Sequence[int], goes: Mapping[tuple[int, int], int]) -> tuple[list[int], list[int], list[int]]:
-        """The dstates of all steps with the fewest faults; the steps whose action is not known there; and the steps with a fault."""
-        count = len(shows)
-        prices = (np.array(self._price.get(kind, [NEVER] * self.size), dtype=float) for kind in ("slipped", "misread"))
-        slip, misread = prices
-        moves = np.full((max(self._actions, default=0) + 1, count, count), slip[0])
-        for action in range(len(moves)):
-            for s in range(count):
-                target = goes.get((s, action))
-                if target is None:
-                    moves[action, s] = UNKNOWN
-                else:
-                    moves[action, s, target] = 0.0
-        wrong = np.where(np.array(shows)[None, :] == np.arange(max(self._seen) + 1)[:, None], 0.0, 1.0)
-        spent = wrong[self._seen[0]] * misread[0]
-        came = np.zeros((self.size, count), dtype=np.int32)
-        for t in range(1, self.size):
-            ways = spent[:, None] + moves[self._actions[t - 1]]
-            came[t] = ways.argmin(axis=0)
-            spent = ways[came[t], np.arange(count)] + wrong[self._seen[t]] * misread[t]
-        labels = [int(spent.argmin())]
-        for t in range(self.size - 1, 0, -1):
-            labels.append(int(came[t, labels[-1]]))
-        labels.reverse()
-        unknown = [t for t in range(self.size - 1) if (labels[t], self._actions[t]) not in goes]
-        faults = [t for t in range(self.size) if shows[labels[t]] != self._seen[t]]
-        faults += [t for t in range(self.size - 1) if goes.get((labels[t], self._actions[t]), labels[t + 1]) != labels[t + 1]]
-        return labels, unknown, faults
+        if any(all(labels[one.first] == labels[one.second] for one in together) for together in self._forbidden):
+            return None
+        if self._task.log.pairs.broken_by(labels) or (self._most_faults is not None and len(explained.faults) > self._most_faults):
+            return None
+        return self._found(labels, explained.slips, {}, shows)
 
     def _found(self, labels: Sequence[int], slips: Collection[int], number: Mapping[int, int], shows: Sequence[int] | None = None) -> Found:
         """A map of the whole trace, and what it costs."""

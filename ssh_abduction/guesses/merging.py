@@ -116,10 +116,28 @@ def thinned(chart: Chart, labels: Sequence[int], check: Callable[[], None] = lam
     first = np.unique(dstates, return_index=True)[1]
     links = list(dict.fromkeys((dstates[t], action, dstates[u]) for t, action, u in chart.links))
     excluded = [(dstates[i], dstates[j]) for i, j in chart.excluded]
-    classes = _Classes(_apart_in_map(np.asarray(chart.seen)[first], links, excluded, check), links, check, np.bincount(dstates))
+    root = np.array(thinned_map(np.asarray(chart.seen)[first].tolist(), links, np.bincount(dstates).tolist(), check, excluded))
+    return numbered(root[dstates].tolist())
+
+
+def thinned_map(
+    shows: Sequence[int],
+    links: Sequence[Link],
+    visits: Sequence[int],
+    check: Callable[[], None] = lambda: None,
+    excluded: Sequence[tuple[int, int]] = (),
+) -> list[int]:
+    """The dstate that each dstate of a map is merged with, until no two can be one: those visited least first, each with the one for which there is most evidence.
+
+    shows     the view of each dstate
+    visits    how many nodes are at each
+    excluded  pairs of dstates that are not one
+    """
+    classes = _Classes(_apart_in_map(np.asarray(shows), links, excluded, check), links, check, np.asarray(visits))
     classes.known[:] = True
     classes.thin_all()
-    return numbered(classes.root[dstates].tolist())
+    root: list[int] = classes.root.tolist()
+    return root
 
 
 def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link], excluded: Sequence[tuple[int, int]], check: Callable[[], None]) -> Matrix:
