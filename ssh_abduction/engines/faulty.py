@@ -266,7 +266,9 @@ class FaultyEngine:
         """Answers for the given steps that cost so much, which is the least."""
         self._prepare()
         seen: set[tuple[frozenset[tuple[int, int]], frozenset[int]]] = set()
-        for answer in self.asker.answers(self._read, f"enum,{cost}", 0):
+        # Of a long trace the bound is proven by blocks, and not of the steps that clingo was given.
+        mode = f"optN,{cost}" if self.size < LONG else f"enum,{cost}"
+        for answer in (answer for answer in self.asker.answers(self._read, mode, 0) if answer.cost == cost):
             told = frozenset(answer.where.items()), answer.slips
             if told not in seen:
                 seen.add(told)
