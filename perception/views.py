@@ -19,7 +19,7 @@ from sklearn.base import BaseEstimator, ClusterMixin, clone
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import BayesianGaussianMixture, GaussianMixture
-from sklearn.neighbors import KNeighborsClassifier
+from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 from threadpoolctl import threadpool_limits
@@ -39,6 +39,10 @@ NEAR = 1.5
 APART = 2.3
 # Medians of trimmed M that differ by less than a twentieth do not tell two k apart: then the smaller one is preferred.
 EQUAL = 0.95
+# Which image is isolated is told by its third nearest neighbour, so that two or three that show the same stranger are isolated, too.
+NEIGHBOURS = 3
+# For which `isolated` the loop takes images to be noise where views may be disbelieved. docs/reproduction.md has what it rests on.
+ISOLATED = 10.0
 
 
 class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
@@ -59,10 +63,12 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     random_state  seed, RandomState or None; if the clusterer has a seed of its own, that is used instead
     by            "M", or "trimmed" for the smallest k with a trimmed M of at least 0.95 times the largest
     trim          the share of distances that trimmed M leaves out at each end, in [0, 0.5]
+    isolated      an image is noise, and takes no part in the clustering, where its third nearest neighbour is more than so many times as far as that of the
+                  middle image; more than 1. So a view that was seen three times or less is noise where most were seen more often. None: no image is isolated
 
     Attributes
     ----------
-    labels_           (n,) views of the fitted images; -1 where the clusterer says that an image is noise
+    labels_           (n,) views of the fitted images; -1 where an image is isolated, or the clusterer says that it is noise
     k_                how many views there are, noise not counted
     confidence_       (n,) how sure each view is, in [0, 1]; 0 for noise (perception.confidence)
     quality_          M for each k that was tried, noise left out; only one, where the clusterer finds k itself
@@ -87,6 +93,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         random_state: int | np.random.RandomState | None = None,
         by: str = "M",
         trim: float = 0.5,
+        isolated: float | None = None,
     ) -> None:
         self.k = k
         self.k_min = k_min
@@ -96,12 +103,30 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         self.random_state = random_state
         self.by = by
         self.trim = trim
+        self.isolated = isolated
 
     def fit(self, X: ArrayLike, y: Any = None) -> Self:
         self._check()
         images = validate_data(self, equal_length(X), dtype=np.float64, ensure_min_samples=2)
         if (images == images[0]).all():
             return self._one_view(images)
+        return self._fit_all(images) if self.isolated is None else self._fit_together(images)
+
+    def _fit_together(self, images: NDArray[np.float64]) -> Self:
+        """Fit to the images that are not isolated. The others are noise."""
+        far = _to_neighbour(images, images, 1)
+        self.reach_ = float(self.isolated or math.inf) * float(np.median(far))
+        inside = (far <= self.reach_) | (self.reach_ == 0)
+        if (images[inside] == images[inside][0]).all():
+            inside[:] = True
+        self._fit_all(images[inside])
+        self.labels_by_k_: dict[int, NDArray[np.intp]] = {k: _among(inside, labels) for k, labels in self.labels_by_k_.items()}
+        self.labels_ = self.labels_by_k_[self.k_]
+        self.confidence_, self.inside_ = confidence(images, self.labels_), images[inside]
+        return self
+
+    def _fit_all(self, images: NDArray[np.float64]) -> Self:
+        """Fit to images that are not all equal."""
         seed = int(check_random_state(self.random_state).randint(2**31 - 1))
         if self.clusterer is not None and _size(self.clusterer) is None:
             best = self._cluster(images, None, seed)
@@ -117,13 +142,16 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
     def predict(self, X: ArrayLike) -> NDArray[np.intp]:
         """The views of images, (n,), as the clusterer predicts them (k-means: by the nearest centre). For a clusterer that does not predict, the view of the
-        nearest image that was fitted.
+        nearest image that was fitted. -1 for an image that is isolated among those that were fitted.
         """
         check_is_fitted(self)
         images = validate_data(self, equal_length(X), dtype=np.float64, reset=False)
         if self.clusterer_ is None:
             return np.zeros(len(images), np.intp)
-        return np.asarray((self.clusterer_ if self.nearest_ is None else self.nearest_).predict(images), np.intp)
+        views = np.asarray((self.clusterer_ if self.nearest_ is None else self.nearest_).predict(images), np.intp)
+        if self.isolated is not None and self.reach_ > 0:
+            views[_to_neighbour(images, self.inside_, 0) > self.reach_] = NOISE
+        return views
 
     def score(self, X: ArrayLike, y: Any = None) -> float:
         """M of the views of images, (n, d), as `predict` gives them; larger is better. NaN where they have one view."""
@@ -227,6 +255,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 raise PerceptionError(f"{name}: expected a whole number of at least {least}, got {value!r}")
         if self.by not in ("M", "trimmed"):
             raise PerceptionError(f'by: expected "M" or "trimmed", got {self.by!r}')
+        if self.isolated is not None and not (isinstance(self.isolated, int | float | np.number) and 1 < self.isolated < math.inf):
+            raise PerceptionError(f"isolated: expected a number of more than 1, or None, got {self.isolated!r}")
         if self.k is None and self.k_max is not None and self.k_max < self.k_min:
             raise PerceptionError(f"k_max: expected at least k_min = {self.k_min}, got {self.k_max}")
         if self.clusterer is not None and not (hasattr(self.clusterer, "fit") and hasattr(self.clusterer, "get_params")):
@@ -249,6 +279,23 @@ def as_view_clusterer(clusterer: Any) -> ViewClusterer:
     checked._check()
     size = _size(clusterer)
     return checked if size is None else checked.set_params(k=clusterer.get_params()[size])
+
+
+def _to_neighbour(images: NDArray[np.float64], among: NDArray[np.float64], itself: int) -> NDArray[np.float64]:
+    """How far each image is from its third nearest neighbour among others, (n,); from the last one, where there are fewer.
+
+    itself  1 where each image is among these, too, else 0
+    """
+    number = min(NEIGHBOURS + itself, len(among))
+    distances, _ = NearestNeighbors(n_neighbors=number, algorithm="brute").fit(among).kneighbors(images)
+    return np.asarray(distances[:, -1])
+
+
+def _among(inside: NDArray[np.bool_], labels: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The labels of the images that are inside, and noise for the others."""
+    every = np.full(len(inside), NOISE, np.intp)
+    every[inside] = labels
+    return every
 
 
 def _smallest_good(worth: dict[int, float]) -> int:

@@ -18,7 +18,7 @@ from sklearn.base import BaseEstimator, clone
 
 from perception.confidence import warn_of_doubts
 from perception.recognition import recogniser
-from perception.views import ViewClusterer, as_view_clusterer
+from perception.views import ISOLATED, ViewClusterer, as_view_clusterer
 from ssh_abduction.labels import AmbiguousMapWarning, LearnerError, labels_of, labels_of_all, labels_on, map_of
 from ssh_abduction.runner_up import RunnerUpWarning, warn_of_second_map
 from ssh_abduction.solver.search import solve
@@ -33,14 +33,15 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     """Learns to recognise places from a trace of images and actions, without being told any place. An estimator, as scikit-learn has them.
 
     theory     the axioms; Theory.topological() by default
-    clusterer  makes views of images: a ViewClusterer, or a clusterer of scikit-learn's. It is cloned. ViewClusterer(random_state=0) by default
+    clusterer  makes views of images: a ViewClusterer, or a clusterer of scikit-learn's. It is cloned. ViewClusterer(random_state=0) by default,
+               and with `isolated=10` where the theory allows views that are misread: images that are like no others then have no view, and disbelieving them costs little
     choose     the index of the map to take where several remain; None takes the labels on which all of them agree
     limit      seconds for finding the map
     features   makes of images what is clustered and compared: a transformer of scikit-learn's kind. It is cloned. None for reciprocals of ranges, and for a PanoramaTransformer where
                the header of a trace says that its images are panoramas
 
     After `fit` there are features_, clusterer_, views_ and confidence_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree or an image has no view,
-    recogniser_, and second_map_, the map of the runner-up, where another number of views is about as good and gives another map.
+    recogniser_, which has not learnt from images that the map says are misread, and second_map_, the map of the runner-up, where another number of views is about as good and gives another map.
 
     Of several traces all images make the views, the longest trace makes the map, and the others are followed on it; n counts their steps, one after the other.
     """
@@ -58,12 +59,13 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     def fit(self, X: Trace | Sequence[Trace], y: Any = None) -> BootstrapLearner:
         """Run the loop on a trace, or on several. Raises LearnerError, PerceptionError, TraceError."""
         traces, theory = Traces.of(X), checked_theory(self.theory)
-        seen = self._look(traces)
+        seen = self._look(traces, ISOLATED if theory.misread else None)
         self.solution_ = solve(seen.each[seen.longest], theory, limit=self.limit)
         self.map_, mapped = map_of(self.solution_, self.choose)
         self.second_map_ = warn_of_second_map(seen.each[seen.longest], self.solution_.maps, theory, self.limit)
         self.labels_ = labels_of_all(self.map_, mapped, seen, self.views_, self.features_)
         sure = self.labels_ >= 0
+        sure[traces.at_longest([fault.step for fault in self.map_.faults if fault.kind == "misread"])] = False
         self.recogniser_ = recogniser(features=self.features_).fit(traces.images[sure], self.labels_[sure])
         return self
 
@@ -89,11 +91,12 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
             raise LearnerError("traces: expected some steps whose dstate the map tells, got none; score a trace of the same world")
         return float(np.mean(found[true >= 0] == true[true >= 0]))
 
-    def _look(self, traces: Traces) -> Traces:
+    def _look(self, traces: Traces, isolated: float | None) -> Traces:
         """The traces with their views, and, where there is one, with those of the runner-up."""
+        usual = ViewClusterer(random_state=0, isolated=isolated)
         self.features_ = (traces.features if self.features is None else clone(self.features)).fit(traces.images)
         images = self.features_.transform(traces.images)
-        self.clusterer_ = as_view_clusterer(ViewClusterer(random_state=0) if self.clusterer is None else clone(self.clusterer)).fit(images)
+        self.clusterer_ = as_view_clusterer(usual if self.clusterer is None else clone(self.clusterer)).fit(images)
         self.views_, self.confidence_ = self.clusterer_.labels_, self.clusterer_.confidence_
         warn_of_doubts(self.views_, self.confidence_, self.clusterer_.quality_[self.clusterer_.k_])
         return traces.with_views(images, self.views_, self.clusterer_.runner_up_labels_, self.confidence_)

@@ -72,6 +72,11 @@ class Traces:
         """The number of the longest trace, the first of several."""
         return max(range(len(self.each)), key=lambda i: (len(self.each[i]), -i))
 
+    def at_longest(self, steps: Sequence[int]) -> Integers:
+        """Which of all steps these steps of the longest trace are."""
+        before = sum(len(trace) for trace in self.each[: self.longest])
+        return before + np.asarray(steps, np.intp)
+
     def parts(self, of_all: NDArray[Any]) -> list[NDArray[Any]]:
         """What is told of all steps, (n, …), trace by trace."""
         return np.split(of_all, np.cumsum([len(trace) for trace in self.each])[:-1])

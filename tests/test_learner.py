@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import html
 import inspect
 import io
 import json
+import math
 import subprocess
 import sys
 import warnings
@@ -502,3 +504,44 @@ def test_a_summary_counts_the_seeds_in_which_a_claim_holds() -> None:
     assert table["U at that k"]["holds"] == 1
     assert table["dstates, places, paths, from the views alone"]["here"] == {"500": "8, 4, 4", "1": "9, 4, 4"}
     assert table["labels from the views alone are the true dstates"]["holds"] == 1
+
+
+@pytest.mark.parametrize("kind", ["person", "random"])
+def test_bad_images_are_disbelieved_where_views_may_be_misread(kind: str) -> None:
+    trace = simulate(World.named("notched-rectangle"), tours=8, seed=503)
+    images, bad, rng = images_of(trace).copy(), [9, 30, 44], np.random.default_rng(0)  # one of twenty
+    for i in bad:
+        images[i] = (
+            np.minimum(images[i], np.where(abs(np.arange(180) - 90) < 20, 0.4, np.inf)) if kind == "person" else rng.uniform(0.1, 8, 180)
+        )
+    spoilt = replace(trace, steps=tuple(replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)))
+    with pytest.warns(ImageWarning, match="3 of 64 images are like those of no view"):
+        learner = BootstrapLearner(Theory.topological().replace(misread=1.5)).fit(spoilt)
+    assert one_to_one(np.array(learner.map_.labels), true_dstates(trace))
+    assert np.flatnonzero(learner.labels_ < 0).tolist() == bad
+    assert {fault.step for fault in learner.map_.faults} <= set(bad)
+    other = simulate(World.named("notched-rectangle"), tours=2, seed=504)
+    without = BootstrapLearner().fit(trace)
+    meaning = dict(zip(true_dstates(trace), zip(learner.map_.labels, without.labels_, strict=True), strict=True))
+    names = np.array([meaning[name] for name in true_dstates(other)])
+    assert np.mean(learner.predict(other) == names[:, 0]) >= 0.98 * np.mean(without.predict(other) == names[:, 1])
+    assert learner.clusterer_.predict(ReciprocalTransformer().fit_transform(images))[bad].tolist() == [-1, -1, -1]
+
+
+def test_bad_images_are_named_where_no_fault_is_allowed() -> None:
+    trace = simulate(World.named("notched-rectangle"), tours=4, seed=503)
+    images = images_of(trace).copy()
+    images[9] = np.random.default_rng(0).uniform(0.1, 8, 180)
+    spoilt = replace(trace, steps=tuple(replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        learner = BootstrapLearner(limit=1)
+        with contextlib.suppress(LearnerError):  # with openings and displacements there may be no map at all
+            learner.fit(spoilt)
+    assert any("(image 9" in str(w.message) for w in caught)
+
+
+def test_who_is_isolated_is_a_number_above_one(run: Trace) -> None:
+    for wrong in (1, -3.0, math.nan, "far"):
+        with pytest.raises(PerceptionError, match="isolated: expected a number of more than 1, or None"):
+            ViewClusterer(isolated=wrong).fit(images_of(run))  # type: ignore[arg-type]

@@ -1,0 +1,148 @@
+"""The loop where one image of twenty is bad: whether its map is right, which bad images it names, and what its recogniser is worth.
+
+    python benchmarks/bad_images.py [--world notched-rectangle] [--tours 10] [--seeds 300-309] [--only TEXT] [--page docs/reproduction.md]
+
+Bad images show a person in front of the laser, a person at its side, or anything at random (benchmarks/doubts.py). Maps are sought for at most ten seconds, by the
+default theory: openings and displacements are told. The recogniser is tried on the images of another drive, of three circuits, none of them bad.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from doubts import DOUBTS, spoilt
+from numpy.typing import NDArray
+
+from perception.confidence import NOISE
+from perception.errors import PerceptionError
+from perception.images import images_of
+from perception.views import ViewClusterer
+from simulator.tours import simulate
+from simulator.world import World
+from ssh_abduction.learner import BootstrapLearner, LearnerError
+from ssh_abduction.reproduce.claims import one_to_one, true_dstates
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Trace
+from ssh_abduction.traces import Traces
+
+SHARE = 0.05
+SECONDS = 10.0
+KINDS = ("person in front", "person at the side", "random image")
+PLAIN = Theory.topological()
+FAULTS = PLAIN.replace(misread=1.5)
+
+
+class Unsure(BootstrapLearner):
+    """A learner whose solver is not told how sure views are."""
+
+    def _look(self, traces: Traces, isolated: float | None) -> Traces:
+        seen = super()._look(traces, isolated)
+        return Traces(tuple(replace(t, steps=tuple(replace(s, confidence=None) for s in t.steps)) for t in seen.each))
+
+
+def learners() -> Iterator[tuple[str, BootstrapLearner]]:
+    """What is compared: a row of the table each."""
+    by = {name: ViewClusterer(by=name, random_state=0) for name in ("M", "trimmed")}
+    yield "no faults, M", BootstrapLearner(PLAIN, by["M"], limit=SECONDS)
+    yield "no faults, trimmed M", BootstrapLearner(PLAIN, by["trimmed"], limit=SECONDS)
+    yield "misread=1.5, M, confidence unused", Unsure(FAULTS, by["M"], limit=SECONDS)
+    yield "misread=1.5, M", BootstrapLearner(FAULTS, by["M"], limit=SECONDS)
+    yield "misread=1.5, trimmed M", BootstrapLearner(FAULTS, by["trimmed"], limit=SECONDS)
+    yield "misread=1.5, isolated images are noise (default)", BootstrapLearner(FAULTS, limit=SECONDS)
+
+
+def with_bad_images(trace: Trace, kind: str, seed: int) -> tuple[Trace, NDArray[np.intp]]:
+    """The trace with one image of twenty bad, and which these are."""
+    images, bad = spoilt(images_of(trace), kind, round(SHARE * len(trace)), np.random.default_rng(seed))
+    return replace(trace, steps=tuple(replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True))), bad
+
+
+@dataclass(frozen=True)
+class Found:
+    """What came of one drive.
+
+    right     the map is the true one
+    said      there was a warning, or no map
+    named     the images without a view, and those that the map says are misread; how many, and how many of them are bad
+    accuracy  of the recogniser on images of another drive
+    """
+
+    right: bool
+    said: bool
+    named: int
+    hits: int
+    accuracy: float
+
+
+def found(learner: BootstrapLearner, trace: Trace, bad: NDArray[np.intp], other: Trace) -> Found:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            learner.fit(trace)
+        except (LearnerError, PerceptionError):
+            return Found(False, True, 0, 0, 0.0)
+    truth, labels = true_dstates(trace), np.array(learner.map_.labels)
+    named = {f.step for f in learner.map_.faults if f.kind == "misread"} | set(np.flatnonzero(learner.views_ == NOISE).tolist())
+    said = any(issubclass(w.category, DOUBTS) for w in caught)
+    meant = {label: _most(truth[labels == label]) for label in set(labels.tolist())}
+    hit = [meant.get(int(label)) == name for label, name in zip(learner.predict(other), true_dstates(other), strict=True)]
+    return Found(one_to_one(labels, truth), said, len(named), len(named & set(bad.tolist())), float(np.mean(hit)))
+
+
+def _most(names: NDArray[Any]) -> Any:
+    """The most frequent one."""
+    values, counts = np.unique(names, return_counts=True)
+    return values[counts.argmax()]
+
+
+def rows(world: str, tours: int, seeds: list[int], only: str) -> Iterator[str]:
+    yield f"| {world}, {len(seeds)} drives of {tours} circuits | bad images | map right | wrong, and nothing said | precision | recall | 1-NN, relative: mean | least |"
+    yield "|---|---|---|---|---|---|---|---|"
+    drives = [simulate(World.named(world), tours, seed) for seed in seeds]
+    others = [simulate(World.named(world), 3, 1000 + seed) for seed in seeds]
+    nobody = np.array([], np.intp)
+    clean = [
+        found(BootstrapLearner(PLAIN, limit=SECONDS), drive, nobody, other).accuracy for drive, other in zip(drives, others, strict=True)
+    ]
+    for name, learner in learners():
+        if only not in name:
+            continue
+        for kind in KINDS if "default" not in name else (*KINDS, "none"):
+            spoiled = [with_bad_images(d, kind, seed) if kind != "none" else (d, nobody) for d, seed in zip(drives, seeds, strict=True)]
+            got = [found(learner, trace, bad, other) for (trace, bad), other in zip(spoiled, others, strict=True)]
+            hits, named, bad_ones = sum(g.hits for g in got), sum(g.named for g in got), sum(len(bad) for _, bad in spoiled)
+            precision = f"{hits / named:.2f}" if named else "–"
+            recall = f"{hits / bad_ones:.2f}" if bad_ones else "–"
+            relative = [g.accuracy / c for g, c in zip(got, clean, strict=True)]
+            silent = sum(not g.right and not g.said for g in got)
+            yield f"| {name} | {kind} | {sum(g.right for g in got)} | {silent} | {precision} | {recall} | {np.mean(relative):.3f} | {min(relative):.3f} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--world", default="notched-rectangle")
+    parser.add_argument("--tours", type=int, default=10)
+    parser.add_argument("--seeds", default="300-309", help="first and last seed")
+    parser.add_argument("--only", default="", help="only the rows whose name contains this")
+    parser.add_argument("--page", type=Path, help="page whose table of this world is to be replaced")
+    options = parser.parse_args()
+    first, _, last = options.seeds.partition("-")
+    lines = []
+    for line in rows(options.world, options.tours, list(range(int(first), int(last or first) + 1)), options.only):
+        print(line, flush=True)
+        lines.append(line)
+    if options.page:
+        text = options.page.read_text()
+        table = re.compile(rf"\| {options.world}, \d+ drives.*?(?=\n\n)", re.DOTALL)
+        options.page.write_text(table.sub(lambda _: "\n".join(lines), text))
+
+
+if __name__ == "__main__":
+    main()
