@@ -9,7 +9,6 @@ default theory: openings and displacements are told. The recogniser is tried on 
 from __future__ import annotations
 
 import argparse
-import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 from doubts import DOUBTS, spoilt
 from numpy.typing import NDArray
+from pages import print_rows, seeds_from
 
 from perception.confidence import NOISE
 from perception.errors import PerceptionError
@@ -133,15 +133,8 @@ def main() -> None:
     parser.add_argument("--only", default="", help="only the rows whose name contains this")
     parser.add_argument("--page", type=Path, help="page whose table of this world is to be replaced")
     options = parser.parse_args()
-    first, _, last = options.seeds.partition("-")
-    lines = []
-    for line in rows(options.world, options.tours, list(range(int(first), int(last or first) + 1)), options.only):
-        print(line, flush=True)
-        lines.append(line)
-    if options.page:
-        text = options.page.read_text()
-        table = re.compile(rf"\| {options.world}, \d+ drives.*?(?=\n\n)", re.DOTALL)
-        options.page.write_text(table.sub(lambda _: "\n".join(lines), text))
+    found = rows(options.world, options.tours, seeds_from(options.seeds), options.only)
+    print_rows(found, options.page, rf"\| {options.world}, \d+ drives")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pages import print_rows, seeds_from
 
 from perception.errors import ImageWarning, PerceptionError
 from perception.images import images_of
@@ -180,20 +181,12 @@ def main() -> None:
     parser.add_argument("--page", type=Path, help="page whose table is to be replaced")
     parser.add_argument("--tolerances", action="store_true", help="print the spread of poses by the tolerance of hill-climbing instead")
     options = parser.parse_args()
-    first, _, last = options.seeds.partition("-")
-    seeds = list(range(int(first), int(last or first) + 1))
+    seeds = seeds_from(options.seeds)
     if options.tolerances:
         for line in tolerances(seeds, options.tours):
             print(line, flush=True)
         return
-    lines = []
-    for line in rows(seeds, options.tours):
-        print(line, flush=True)
-        lines.append(line)
-    if options.page:
-        text = options.page.read_text()
-        table = re.compile(r"\| the notched rectangle, but .*?(?=\n\n)", re.DOTALL)
-        options.page.write_text(table.sub(lambda _: "\n".join(lines), text))
+    print_rows(rows(seeds, options.tours), options.page, r"\| the notched rectangle, but ")
 
 
 if __name__ == "__main__":

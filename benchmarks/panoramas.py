@@ -26,6 +26,7 @@ import networkx as nx
 import numpy as np
 import streets
 from numpy.typing import NDArray
+from pages import seeds_from
 from scipy.optimize import linear_sum_assignment
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.cluster import HDBSCAN, AgglomerativeClustering, SpectralClustering
@@ -299,9 +300,8 @@ def main() -> None:
     if options.figure:
         figure(options.figure)
         return
-    first, _, last = options.seeds.partition("-")
     lines: dict[str, list[str]] = {}
-    for name, line in tables(list(range(int(first), int(last or first) + 1)), options.workers):
+    for name, line in tables(seeds_from(options.seeds), options.workers):
         print(line, flush=True)
         lines.setdefault(name, []).append(line)
     if options.page:

@@ -56,16 +56,22 @@ def partitions(steps: int) -> Iterator[tuple[int, ...]]:
     yield from found
 
 
+def votes(trace: Trace, labels: tuple[int, ...]) -> tuple[dict[int, Counter[object]], dict[tuple[int, str], Counter[int]]]:
+    """How often each view is seen at each dstate, and how often each action done there leads where."""
+    views, ends = defaultdict(Counter), defaultdict(Counter)
+    for label, view in zip(labels, trace.views, strict=True):
+        views[label][view] += 1
+    for (s, x), action in zip(pairwise(labels), trace.actions, strict=False):
+        ends[s, action.name][x] += 1
+    return views, ends
+
+
 def cheapest(trace: Trace, misread: int, slipped: int) -> tuple[int | None, set[Told]]:
     """The least cost in tenths, and all causal maps of it, by trying all labels, all views of dstates and all ends of actions."""
     best: int | None = None
     maps: set[Told] = set()
     for labels in partitions(len(trace)):
-        views, ends = defaultdict(Counter), defaultdict(Counter)
-        for label, view in zip(labels, trace.views, strict=True):
-            views[label][view] += 1
-        for (s, x), action in zip(pairwise(labels), trace.actions, strict=False):
-            ends[s, action.name][x] += 1
+        views, ends = votes(trace, labels)
         for shows in product(*(list(views[s]) for s in sorted(views))):
             for targets in product(*(list(counts) for counts in ends.values())):
                 goes = dict(zip(ends, targets, strict=True))
@@ -288,11 +294,7 @@ def fewest(trace: Trace, faults: int, kinds: set[str]) -> int:
     """The fewest dstates with so many faults, by trying all labels."""
     counts = []
     for labels in partitions(len(trace)):
-        views, ends = defaultdict(Counter), defaultdict(Counter)
-        for label, view in zip(labels, trace.views, strict=True):
-            views[label][view] += 1
-        for (s, x), action in zip(pairwise(labels), trace.actions, strict=False):
-            ends[s, action.name][x] += 1
+        views, ends = votes(trace, labels)
         wrong, slips = (sum(sum(c.values()) - max(c.values()) for c in found.values()) for found in (views, ends))
         if (not wrong or "misread" in kinds) and (not slips or "slipped" in kinds) and wrong + slips <= faults:
             counts.append(len(views))

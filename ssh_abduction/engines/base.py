@@ -92,7 +92,7 @@ class Task:
     def of(trace: Trace, theory: Theory, watch: Watch | None = None, speedups: Speedups | None = None) -> Task:
         """A task for all speed-ups that hold for a theory, or for these of them."""
         speedups = (speedups or Speedups()).that_hold_for(theory)
-        if any(action.slipped for action in trace.actions):  # `sides` takes all that links two visits for a travel
+        if speedups.sides and any(action.slipped for action in trace.actions):  # `sides` takes all that links two visits for a travel
             speedups = replace(speedups, sides=False)
         return Task(trace, theory, Log(trace, theory), watch or Watch(), speedups)
 

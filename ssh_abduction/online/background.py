@@ -7,18 +7,17 @@ takes longer than a step may, it is done in the other process, in which else one
 
 from __future__ import annotations
 
-import threading
-import weakref
 from collections.abc import Sequence
-from concurrent.futures import Future
+from functools import partial
 
 from ssh_abduction.asp.control import has_processors
-from ssh_abduction.asp.limits import LimitError, Watch
+from ssh_abduction.asp.limits import Watch
 from ssh_abduction.asp.process import in_process
 from ssh_abduction.engines.base import Task
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.odometry import Odometry
+from ssh_abduction.online.beside import Beside
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Step, Trace
@@ -37,8 +36,8 @@ def mended_map(trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, 
     return found.map if found else None
 
 
-class MapGuess:
-    """A map of a trace that grows, made in a process of its own. That ends when this is no longer referred to, and with the program.
+class MapGuess(Beside[SSHMap]):
+    """A map of a trace that grows, made in a process of its own.
 
     A map is made of a guess, unless one is known. As the trace has grown meanwhile, and may contradict it, it is mended at the end.
 
@@ -49,11 +48,7 @@ class MapGuess:
     def __init__(
         self, steps: Sequence[Step], odometry: Odometry | None, theory: Theory, speedups: Speedups, known: SSHMap | None = None
     ) -> None:
-        self._found: Future[SSHMap | None] = Future()
-        watch = Watch()
-        thread = threading.Thread(target=_make, args=(steps, odometry, theory, speedups, known, watch, self._found), daemon=True)
-        weakref.finalize(self, _end, watch, thread)
-        thread.start()
+        super().__init__(partial(_make, steps, odometry, theory, speedups, known))
 
     @staticmethod
     def begun(
@@ -63,34 +58,15 @@ class MapGuess:
         wanted = speedups.annealed and speedups.processes and has_processors(speedups)
         return MapGuess(steps, odometry, theory, speedups, known) if wanted else None
 
-    def done(self) -> bool:
-        return self._found.done()
-
     def map(self) -> SSHMap | None:
         """The map of the first steps, if one was found. Waits until that is known."""
-        return self._found.result()
+        return self.result()
 
 
 def _make(
-    steps: Sequence[Step],
-    odometry: Odometry | None,
-    theory: Theory,
-    speedups: Speedups,
-    known: SSHMap | None,
-    watch: Watch,
-    found: Future[SSHMap | None],
-) -> None:
-    try:
-        known = known or in_process(guessed_map, Trace(tuple(steps), odometry=odometry), theory, speedups, watch=watch)
-        if known and len(steps) > len(known.labels):
-            known = in_process(mended_map, Trace(tuple(steps), odometry=odometry), theory, known, speedups, watch=watch)
-        found.set_result(known)
-    except LimitError:
-        found.set_result(None)
-    except BaseException as error:
-        found.set_exception(error)
-
-
-def _end(watch: Watch, thread: threading.Thread) -> None:
-    watch.interrupted = True
-    thread.join()
+    steps: Sequence[Step], odometry: Odometry | None, theory: Theory, speedups: Speedups, known: SSHMap | None, watch: Watch
+) -> SSHMap | None:
+    known = known or in_process(guessed_map, Trace(tuple(steps), odometry=odometry), theory, speedups, watch=watch)
+    if known and len(steps) > len(known.labels):
+        known = in_process(mended_map, Trace(tuple(steps), odometry=odometry), theory, known, speedups, watch=watch)
+    return known

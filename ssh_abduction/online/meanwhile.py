@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import threading
-import weakref
-from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 
 from ssh_abduction.asp.control import has_processors
-from ssh_abduction.asp.limits import LimitError, Stop, Watch
+from ssh_abduction.asp.limits import Stop, Watch
 from ssh_abduction.asp.process import in_process
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.online.beside import Beside
 from ssh_abduction.solver.result import Bound, Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.speedups import Speedups
@@ -38,38 +37,17 @@ def solved(trace: Trace, theory: Theory, limit: float | None, maps: int, speedup
     return Solved(len(trace), found.status, found.maps, found.bound, found.complete, found.stopped)
 
 
-class Meanwhile:
-    """Solves the steps so far in a process of its own. That ends when this is no longer referred to, and with the program."""
+class Meanwhile(Beside[Solved]):
+    """Solves the steps so far in a process of its own."""
 
     def __init__(self, trace: Trace, theory: Theory, maps: int, speedups: Speedups) -> None:
-        self._found: Future[Solved | None] = Future()
-        watch = Watch()
-        thread = threading.Thread(target=_solve, args=(trace, theory, maps, speedups, watch, self._found), daemon=True)
-        weakref.finalize(self, _end, watch, thread)
-        thread.start()
+        super().__init__(partial(_solve, trace, theory, maps, speedups))
 
     @staticmethod
     def begun(trace: Trace, theory: Theory, maps: int, speedups: Speedups) -> Meanwhile | None:
         """None where there is no second processor, or processes are not wanted."""
         return Meanwhile(trace, theory, maps, speedups) if speedups.processes and has_processors(speedups) else None
 
-    def done(self) -> bool:
-        return self._found.done()
 
-    def result(self) -> Solved | None:
-        """What was found; None where the process was ended. Waits until that is known."""
-        return self._found.result()
-
-
-def _solve(trace: Trace, theory: Theory, maps: int, speedups: Speedups, watch: Watch, found: Future[Solved | None]) -> None:
-    try:
-        found.set_result(in_process(solved, trace, theory, MEANWHILE, maps, speedups, watch=watch))
-    except LimitError:
-        found.set_result(None)
-    except BaseException as error:
-        found.set_exception(error)
-
-
-def _end(watch: Watch, thread: threading.Thread) -> None:
-    watch.interrupted = True
-    thread.join()
+def _solve(trace: Trace, theory: Theory, maps: int, speedups: Speedups, watch: Watch) -> Solved:
+    return in_process(solved, trace, theory, MEANWHILE, maps, speedups, watch=watch)

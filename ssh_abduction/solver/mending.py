@@ -46,15 +46,14 @@ class Mending:
     def __init__(self, task: Task, solver: Solver) -> None:
         self._task, self._solver = task, solver
         self._without_faults = task.theory.replace(misread=0, slipped=0)
-        self._solved: dict[
-            Trace, tuple[Found | None, bool]
-        ] = {}  # a minimal map of each mended trace, and whether it is known to be minimal
+        # The best map of each mended trace that was solved, and whether it is known to be minimal. One that is not is sought once more where there is more time.
+        self._solved: dict[Trace, tuple[Found | None, bool]] = {}
         self._best: Found | None = None
         self._best_mended: Trace | None = None
         self._cheapest: list[Trace] = []  # what all causal maps mend that cost the least, once these are known
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
         # The log is that of the theory: so stars tell dstates apart, and so do pairs of steps that are not at one place.
-        self._causal = FaultyEngine(replace(Task.of(task.trace, causal, task.watch), log=task.log))
+        self._causal = FaultyEngine(replace(task, theory=causal))
 
     @property
     def bound(self) -> int | None:
@@ -178,7 +177,7 @@ class Mending:
 
         seconds  that it is sought at most
         """
-        if mended not in self._solved or not self._solved[mended][1]:
+        if mended not in self._solved or not (self._solved[mended][1] or seconds < math.inf):
             maps, proven = self._maps_of(mended, 1, seconds)
             self._solved[mended] = self._as_found(maps[0], mended) if maps else None, proven
         return self._solved[mended]
@@ -206,8 +205,9 @@ def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
 
 def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) -> SSHMap:
     """A map of a mended trace as a map of the trace, with what was mended as its faults. Each dstate has the view that most of its steps show."""
-    votes: dict[int, Counter[View | None]] = {}
+    votes: dict[int, Counter[View]] = {}
     for label, step in zip(ssh_map.labels, trace.steps, strict=True):
+        assert step.view is not None
         votes.setdefault(label, Counter())[step.view] += theory.fault_tenths("misread", step) or 1
     shows = {label: max(counts, key=lambda view: counts[view]) for label, counts in votes.items()}
     faults: list[tuple[int, str]] = []
@@ -218,8 +218,6 @@ def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) ->
             faults.append((t, "misseen"))
         if step.action != other.action:
             faults.append((t, "slipped"))
-    labels = dict(enumerate(ssh_map.labels))
-    views = facts.views_of(labels, trace, faults)
-    dstates = tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates)
-    links = facts.links_of(ssh_map.labels, trace, faults)
-    return replace(ssh_map, dstates=dstates, links=links, faults=facts.faults_of(faults, labels, views, trace, theory))
+    told = facts.faults_of(faults, dict(enumerate(ssh_map.labels)), shows, trace, theory)
+    dstates = tuple(replace(s, view=shows[s.id]) for s in ssh_map.dstates)
+    return replace(ssh_map, dstates=dstates, links=facts.links_of(ssh_map.labels, trace, faults), faults=told)

@@ -1,0 +1,31 @@
+"""What benchmarks have in common that write the rows of a table into a page of the documentation."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+
+def seeds_from(text: str) -> list[int]:
+    """The seeds from the first to the last one, written as 300-309; or the one seed.
+
+    >>> seeds_from("300-302"), seeds_from("7")
+    ([300, 301, 302], [7])
+    """
+    first, _, last = text.partition("-")
+    return list(range(int(first), int(last or first) + 1))
+
+
+def print_rows(rows: Iterable[str], page: Path | None, begin: str) -> None:
+    """Print the rows as they come, and let them replace those of a page, where one is given.
+
+    begin  a regular expression for how the first row to be replaced begins; an empty line ends the last one
+    """
+    lines = []
+    for line in rows:
+        print(line, flush=True)
+        lines.append(line)
+    if page:
+        table = re.compile(rf"{begin}.*?(?=\n\n)", re.DOTALL)
+        page.write_text(table.sub(lambda _: "\n".join(lines), page.read_text()))
