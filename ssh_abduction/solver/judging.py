@@ -1,6 +1,6 @@
 """The second net: maps pass the checker, which shares nothing with the encodings, before they are answers.
 
-To check each step of a long replay, or each map of a long list, would take longer than to find them. So checking has a tenth of the time of the search:
+To check each step of a long replay, or each map of a long list, would take longer than to find them. So checking has a tenth of the time of the search, and a hundredth of a second more:
 the first maps are checked always, by the steps that clingo was given at least; of what comes after, as many as that share allows.
 """
 
@@ -16,8 +16,9 @@ from ssh_abduction.theory.evidence import Equality, evidence_of
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
-# At most such a share of the time of the search is spent on checking what is not checked always.
+# At most such a share of the time of the search, and so many seconds more, are spent on checking what is not checked always.
 SHARE = 0.1
+BEYOND = 0.01
 # So many maps are checked however long that takes, by the steps that clingo was given at least.
 ALWAYS = 3
 # So many steps beyond these are looked at where there is no time for all of them.
@@ -93,8 +94,8 @@ class Judging:
         self._judged += 1
 
     def has_time_for(self, steps: int, elapsed: float) -> bool:
-        """Whether a map of so many steps can be checked within the share of the time so far."""
-        return self._shown and self._a_step * steps <= SHARE * elapsed - self._seconds
+        """Whether a map of so many steps can be checked within the share of the time so far. The first short ones always can."""
+        return self._shown and self._a_step * steps <= BEYOND + SHARE * elapsed - self._seconds
 
     def pass_grown_map(self, trace: Trace, ssh_map: SSHMap) -> None:
         """Raise InternalError where a map breaks an axiom, that was replayed along a trace which has grown."""
