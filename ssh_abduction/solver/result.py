@@ -89,6 +89,13 @@ class Progress:
     maps: int
     seconds: float
 
+    @property
+    def sentence(self) -> str:
+        """All of it on one line."""
+        best = f"best {self.cost.dstates} dstates, {self.cost.places} places, {self.cost.paths} paths" if self.cost else "no map yet"
+        bound = ", ".join(f"{k} ≥ {v}" for k, v in self.bound.to_dict().items()) or "no bound yet"
+        return f"prefix {self.prefix} of {self.steps} steps; {best}; {bound}; {self.maps} maps; {self.seconds:.1f} s"
+
 
 @dataclass(frozen=True, slots=True)
 class Level:
