@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from ssh_abduction.engines.base import Cost
-    from ssh_abduction.errors import LocaliserError, MapError, SolverError, SSHError, TheoryError, TraceError
+    from ssh_abduction.errors import LocaliserError, MapError, RangeError, SolverError, SSHError, TheoryError, TraceError
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
     from ssh_abduction.localize import Belief, Chances, Localiser
     from ssh_abduction.maps import DState, Fit, Path, Pose, SSHMap
@@ -27,9 +27,11 @@ if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
     from ssh_abduction.trace import Action, Step, Trace
 
+    __version__: str
+
 _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
-    "errors": ("LocaliserError", "MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
+    "errors": ("LocaliserError", "MapError", "RangeError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
     "localize": ("Belief", "Chances", "Localiser"),
     "maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
@@ -68,6 +70,7 @@ __all__ = [
     "Path",
     "Pose",
     "Progress",
+    "RangeError",
     "Rung",
     "SSHError",
     "SSHMap",
@@ -91,6 +94,11 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     import importlib
 
+    if name == "__version__":
+        from importlib.metadata import version
+
+        globals()[name] = version("ssh-abduction")
+        return globals()[name]
     for module, names in _HOMES.items():
         if name in names:
             value = getattr(importlib.import_module(f"{__name__}.{module}"), name)
@@ -100,4 +108,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "__version__"})

@@ -10,7 +10,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
@@ -142,10 +141,10 @@ class _Json:
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
         """What comes after the maps."""
-        return self._end(solution, explanation, self._search.grounding, self._search.backbone)
+        return self._end(solution, explanation, self._search.backbone)
 
-    def _end(self, solution: Solution, explanation: Explanation | None, grounding: Grounding, backbone: Backbone | None) -> str:
-        return "\n]," + dump(ending(self._search, solution, explanation, self._maps, grounding, backbone))[1:] + "\n"
+    def _end(self, solution: Solution, explanation: Explanation | None, backbone: Backbone | None) -> str:
+        return "\n]," + dump(ending(self._search, solution, explanation, self._maps, backbone))[1:] + "\n"
 
     def last_words(self, why: Stop) -> tuple[str, int]:
         """What is missing, with what is known, where the search cannot be ended in time, and the exit code."""
@@ -154,8 +153,8 @@ class _Json:
         words = "" if self._begun else self._opening()
         if not self._maps and solution.maps:
             words += self._line(solution.maps[0])
-        # Clingo is not asked while another thread is in it; nor is the backbone, which that thread may be changing.
-        return words + self._end(solution, None, Grounding(0, 0), None), exit_code(solution)
+        # The backbone is not asked for, which another thread may be changing.
+        return words + self._end(solution, None, None), exit_code(solution)
 
     def _opening(self) -> str:
         self._begun = True

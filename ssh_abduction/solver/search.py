@@ -69,6 +69,7 @@ from ssh_abduction.theory.evidence import evidence_of, said_by
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Trace, checked_trace
+from ssh_abduction.words import counted
 
 FEW_STEPS = 24  # Traces up to this length skip names and greedy maps: solving them directly is faster.
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.
@@ -186,6 +187,10 @@ class Search:
         self._prefixes = Prefixes(self._task, self._known, self._judging, engine, maps, self._report)
         if after:
             self._take_over(after, minimal)
+
+    def __repr__(self) -> str:
+        best = f", best {counted(len(self.best.dstates), 'dstates')}" if self.best else ""
+        return f"<Search of {counted(len(self.trace), 'steps')}: {self.status.value}{best}, {counted(self.count, 'maps')} given>"
 
     def _new_engine(self) -> Engine:
         """The engine that suits the theory and the length of the trace."""
@@ -527,6 +532,9 @@ class Search:
 
     def solution(self, maps: tuple[SSHMap, ...] = ()) -> Solution:
         """How the search ended, with the maps that the caller kept."""
+        return self._solution(maps, self.grounding)
+
+    def _solution(self, maps: tuple[SSHMap, ...], grounding: Grounding) -> Solution:
         asker = self._engine.asker
         # Perhaps the search ended while the prefix was given to clingo: then what shows the bound is sought in all steps.
         ran_out = self.stopped not in (None, "maps limit")
@@ -547,6 +555,8 @@ class Search:
             within=self.within,
             levels=tuple(self._levels),
             rivals=self._rivals,
+            trace=self.trace,
+            grounding=grounding,
             evidence=said_by(evidence_of(self.theory), self.trace, self._known.refused),
             odometry_warning=(units_warning(self.trace) or noise_warning(self._first.fit)) if self._first and self._first.fit else None,
         )
@@ -564,7 +574,8 @@ class Search:
         if best is not None and self.status is Status.UNKNOWN:
             self._known.status = Status.FEASIBLE
         self._known.stopped = stopped
-        return replace(self.solution(() if best is None else (best,)), complete=self.status is Status.UNSATISFIABLE)
+        # Clingo is not asked how large its program is while another thread is in it.
+        return replace(self._solution(() if best is None else (best,), Grounding(0, 0)), complete=self.status is Status.UNSATISFIABLE)
 
     def _basis_of(self, size: int) -> Basis | None:
         """What shows that no map has fewer dstates: of the first `size` steps."""

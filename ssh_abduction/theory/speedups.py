@@ -21,6 +21,7 @@ from typing import Final
 from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import EXCUSED, Theory
+from ssh_abduction.words import shortly
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +46,9 @@ class Speedups:
         for name in SPEEDUPS:
             if not isinstance(getattr(self, name), bool):
                 raise SolverError(f"speedups: {name}: expected true or false, got {brief(getattr(self, name))}")
+
+    def __repr__(self) -> str:
+        return shortly(self)
 
     @classmethod
     def without(cls, names: str | Iterable[str]) -> Speedups:

@@ -20,6 +20,7 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.trace import Step, Trace
+from ssh_abduction.words import shortly
 
 Count: TypeAlias = Literal["dstates", "paths", "places", "excuses", "auto", "tenths"]
 Pair: TypeAlias = tuple[int, int]  # of steps
@@ -162,6 +163,9 @@ class Theory:
             self._check_faults()
         if "excuses" in self.prefer and self.boundary != "defeasible":
             raise TheoryError(f"prefer: expected no excuses with boundary={self.boundary}; take {_choice('boundary', 'defeasible')}")
+
+    def __repr__(self) -> str:
+        return shortly(self)
 
     def _check_faults(self) -> None:
         if self.prefer != AUTO and self.prefer[:1] != ("dstates",):
