@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ssh_abduction.maps import DState, Fit, Path, Pose, SSHMap
     from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
+    from ssh_abduction.rivals.explore import Experiment, next_experiment
     from ssh_abduction.rungs import Rung, ladder
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
@@ -36,6 +37,7 @@ _HOMES = {  # module: the names that it exports
     "maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
     "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
+    "rivals.explore": ("Experiment", "next_experiment"),
     "rungs": ("Rung", "ladder"),
     "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
@@ -56,6 +58,7 @@ __all__ = [
     "Cost",
     "DState",
     "Evaluation",
+    "Experiment",
     "Fit",
     "Level",
     "Localiser",
@@ -83,6 +86,7 @@ __all__ = [
     "TraceError",
     "evaluate",
     "ladder",
+    "next_experiment",
     "solve",
 ]
 

@@ -95,7 +95,7 @@ class Path:
     order: tuple[int, ...]
 
 
-FAULTS = ("misread", "misseen", "slipped")
+FAULTS = ("misread", "misseen", "slipped", "jumped")
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,14 +104,14 @@ class Fault:
 
     step      the step
     kind      misread: the view at this step is not that of its dstate; misseen: its star is not; slipped: the action done there did not do what its
-              name says, so that nothing links this step and the next one
-    seen      the view, None for a star; or the name of the action
-    expected  the view of the dstate; None for stars and actions
+              name says, so that nothing links this step and the next one; jumped: the displacement from the step before to this one is wrong altogether
+    seen      the view, None for a star; the name of the action; or the displacement, in words
+    expected  the view of the dstate; None for all else
     cost      what it costs, in dstates
     """
 
     step: int
-    kind: Literal["misread", "misseen", "slipped"]
+    kind: Literal["misread", "misseen", "slipped", "jumped"]
     seen: View | None = None
     expected: View | None = None
     cost: float = field(default=0.0, compare=False)
@@ -121,6 +121,8 @@ class Fault:
             return f"the view at step {self.step} is misread: {self.seen}, expected {self.expected}"
         if self.kind == "misseen":
             return f"the star at step {self.step} is misread"
+        if self.kind == "jumped":
+            return f"the displacement that leads to step {self.step} is wrong: {self.seen}"
         return f"the action at step {self.step} slipped: {self.seen}"
 
 

@@ -14,7 +14,7 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -390,6 +390,16 @@ class Trace:
     def without_displacements(self) -> Trace:
         """The same trace, as if the robot had no odometry."""
         return replace(self, steps=tuple(replace(step, displacement=None, covariance=None) for step in self.steps), odometry=None)
+
+    def without_displacements_at(self, steps: Collection[int]) -> Trace:
+        """The same trace, as if the displacements that lead to these steps were not known."""
+        if not steps:
+            return self
+        unknown = set(steps)
+        return replace(
+            self,
+            steps=tuple(replace(step, displacement=None, covariance=None) if t in unknown else step for t, step in enumerate(self.steps)),
+        )
 
     def with_views(self, views: Iterable[View], confidences: Iterable[float | None] | None = None) -> Trace:
         """This trace with these views, and perhaps how probable it is that each is right, one for each step. Raises TraceError."""

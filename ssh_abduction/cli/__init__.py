@@ -18,7 +18,21 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, NoReturn
 
-from ssh_abduction.cli import check, cluster, completion, evaluate, facts, ladder, localize, show, simulate, solve, theory, train
+from ssh_abduction.cli import (
+    check,
+    cluster,
+    completion,
+    evaluate,
+    facts,
+    ladder,
+    localize,
+    next_experiment,
+    show,
+    simulate,
+    solve,
+    theory,
+    train,
+)
 from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.verbosity import add_verbosity, telling
 from ssh_abduction.errors import SSHError, named, printable
@@ -83,7 +97,22 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
     verbs = top.add_subparsers(metavar="VERB", dest="verb", required=True)
-    for verb in (solve, check, evaluate, ladder, localize, show, facts, theory, simulate, cluster, train, reproduction, completion):
+    for verb in (
+        solve,
+        check,
+        evaluate,
+        ladder,
+        localize,
+        next_experiment,
+        show,
+        facts,
+        theory,
+        simulate,
+        cluster,
+        train,
+        reproduction,
+        completion,
+    ):
         verb.add_parser(verbs)
     for each in (top, *verbs.choices.values()):
         add_verbosity(each)

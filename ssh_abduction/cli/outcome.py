@@ -37,7 +37,7 @@ def interrupted_code() -> int:
 
 def explained(search: Search) -> Explanation | None:
     """Why there is no map, if that is so and there is time to find out."""
-    if search.status is not Status.UNSATISFIABLE:
+    if search.status is not Status.UNSATISFIABLE or search.theory.jumped:
         return None
     try:
         return explain(search.trace, search.theory, search.over)

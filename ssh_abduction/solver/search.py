@@ -203,7 +203,7 @@ class Search:
             from ssh_abduction.engines.faulty import FaultyEngine
             from ssh_abduction.engines.framed import FramedEngine
 
-            if self.theory.has_faults and self.theory.level == "causal":
+            if row("named dstates with faults").holds_for(self.theory):
                 return FaultyEngine(self._task)
             if not self.theory.has_faults:
                 return CausalEngine(self._task) if self.theory.level == "causal" else FramedEngine(self._task)
