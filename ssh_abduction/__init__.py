@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from ssh_abduction.maps import DState, Fit, Path, Pose, SSHMap
     from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
+    from ssh_abduction.rivals.compare import Comparison, compare
+    from ssh_abduction.rivals.difference import Difference, difference
+    from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.rungs import Rung, ladder
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
@@ -34,6 +37,9 @@ _HOMES = {  # module: the names that it exports
     "maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
     "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
+    "rivals.compare": ("Comparison", "compare"),
+    "rivals.difference": ("Difference", "difference"),
+    "rivals.listing": ("Listing",),
     "rungs": ("Rung", "ladder"),
     "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
@@ -51,11 +57,14 @@ __all__ = [
     "Bound",
     "Certificate",
     "Chances",
+    "Comparison",
     "Cost",
     "DState",
+    "Difference",
     "Evaluation",
     "Fit",
     "Level",
+    "Listing",
     "Localiser",
     "LocaliserError",
     "MapError",
@@ -78,6 +87,8 @@ __all__ = [
     "TheoryError",
     "Trace",
     "TraceError",
+    "compare",
+    "difference",
     "evaluate",
     "ladder",
     "solve",

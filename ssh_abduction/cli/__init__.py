@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import NoReturn
 
-from ssh_abduction.cli import check, cluster, evaluate, facts, ladder, localize, show, simulate, solve, theory, train
+from ssh_abduction.cli import check, cluster, compare, evaluate, facts, ladder, localize, show, simulate, solve, theory, train
 from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.errors import SSHError, named, printable
 
@@ -48,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
     verbs = top.add_subparsers(metavar="VERB", required=True)
-    for verb in (solve, check, evaluate, ladder, localize, show, facts, theory, simulate, cluster, train, reproduction):
+    for verb in (solve, check, compare, evaluate, ladder, localize, show, facts, theory, simulate, cluster, train, reproduction):
         verb.add_parser(verbs)
     return top
 
