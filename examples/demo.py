@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.cli.text import describe, differences
+from ssh_abduction import Theory, Trace, compare, solve
+from ssh_abduction.cli.text import compared, describe
 from ssh_abduction.judge.checker import check
 from ssh_abduction.picture import svg
 
@@ -23,7 +23,7 @@ def main() -> None:
     for i, ssh_map in enumerate(solution.maps):
         violations = check(trace, ssh_map, theory)
         print(f"\nmap {i + 1}: {violations or 'satisfies every axiom'}\n{describe(ssh_map)}")
-    print(f"\nwhat tells them apart\n{differences(solution.maps, trace)}")
+    print("\nwhat tells them apart", *compared(compare(solution)), sep="\n")
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out")
     folder.mkdir(parents=True, exist_ok=True)
     picture = folder / "aces3-map.svg"

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from ssh_abduction.maps import DState, Fit, Path, Pose, SSHMap
     from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
+    from ssh_abduction.rivals.compare import Comparison, compare
+    from ssh_abduction.rivals.difference import Difference, difference
     from ssh_abduction.rivals.explore import Experiment, next_experiment
+    from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.rungs import Rung, ladder
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
@@ -37,6 +40,9 @@ _HOMES = {  # module: the names that it exports
     "maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
     "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
+    "rivals.compare": ("Comparison", "compare"),
+    "rivals.difference": ("Difference", "difference"),
+    "rivals.listing": ("Listing",),
     "rivals.explore": ("Experiment", "next_experiment"),
     "rungs": ("Rung", "ladder"),
     "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
@@ -55,12 +61,15 @@ __all__ = [
     "Bound",
     "Certificate",
     "Chances",
+    "Comparison",
     "Cost",
     "DState",
+    "Difference",
     "Evaluation",
     "Experiment",
     "Fit",
     "Level",
+    "Listing",
     "Localiser",
     "LocaliserError",
     "MapError",
@@ -84,6 +93,8 @@ __all__ = [
     "TheoryError",
     "Trace",
     "TraceError",
+    "compare",
+    "difference",
     "evaluate",
     "ladder",
     "next_experiment",

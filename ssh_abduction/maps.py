@@ -8,6 +8,7 @@ witnesses, which show that the map is consistent, and others may show it as well
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -96,6 +97,8 @@ class Path:
 
 
 FAULTS = ("misread", "misseen", "slipped", "jumped")
+# So many hexadecimal digits name a map: among a million maps two of one name have a chance of one in five hundred.
+ID_LENGTH = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +155,18 @@ class SSHMap:
         parts += [counted(len(self.faults), "faults")] if self.faults else []
         return f"<SSHMap: {', '.join(parts)}; {counted(len(self.labels), 'steps')}>"
 
+    @property
+    def id(self) -> str:
+        """The map in twelve hexadecimal digits, the same in each run and whatever its dstates, places and paths are numbered like: a digest of what equality compares."""
+        return hashlib.sha256(json.dumps(self._compared(), separators=(",", ":")).encode()).hexdigest()[:ID_LENGTH]
+
+    def _compared(self) -> list[Any]:
+        """What equality compares, as plain data."""
+        whole = self.renumbered()
+        dstates = [(s.view, s.place, s.path, s.direction) for s in whole.dstates]
+        faults = [(fault.step, fault.kind, fault.seen, fault.expected) for fault in whole.faults]
+        return [whole.labels, dstates, whole.links, whole.places, faults]
+
     def without_headings(self) -> SSHMap:
         """The same map for a theory in which places have no frames."""
         return replace(self, dstates=tuple(replace(s, heading=None) for s in self.dstates))
@@ -191,6 +206,7 @@ class SSHMap:
     def to_dict(self) -> dict[str, Any]:
         """The map as plain data, as `solve --json` prints it (docs/formats.md)."""
         data: dict[str, Any] = {
+            "id": self.id,
             "labels": list(self.labels),
             "dstates": [
                 {

@@ -21,6 +21,7 @@ from typing import Any, NoReturn
 from ssh_abduction.cli import (
     check,
     cluster,
+    compare,
     completion,
     evaluate,
     facts,
@@ -100,6 +101,7 @@ def parser() -> argparse.ArgumentParser:
     for verb in (
         solve,
         check,
+        compare,
         evaluate,
         ladder,
         localize,

@@ -20,13 +20,27 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from ssh_abduction.asp.limits import Stop as SearchStop
 from ssh_abduction.cli import EXIT_ERROR, EXIT_INTERRUPTED, workers
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import theory_of
-from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, interrupted_code, on_ctrl_c, opening, told, warn, warnings_of
+from ssh_abduction.cli.outcome import (
+    Given,
+    all_given,
+    dump,
+    ending,
+    exit_code,
+    explained,
+    given_by,
+    interrupted_code,
+    on_ctrl_c,
+    opening,
+    told,
+    warn,
+    warnings_of,
+)
 from ssh_abduction.cli.text import headline
 from ssh_abduction.errors import SolverError, SSHError, brief, named, printable
 from ssh_abduction.explain import Explanation
@@ -115,21 +129,22 @@ class Question:
             speedups=self.speedups,
             on_progress=on_progress,
         )
-        maps: list[dict[str, Any]] = []
+        maps: list[Given] = []
         with self._guarded(number, path, search, maps, given_up):
             for ssh_map in search:
-                maps += [told(search, ssh_map)] if self.json else []
+                maps += [given_by(search, ssh_map)] if self.json else []
             explanation = explained(search)
-            return self._told(number, path, search, search.solution(), maps, explanation, search.backbone)
+            solution = search.solution(tuple(ssh_map for ssh_map, _ in maps))
+            return self._told(number, path, search, solution, all_given(solution), explanation, search.backbone)
 
     def _guarded(
-        self, number: int, path: str, search: Search, maps: list[dict[str, Any]], given_up: Callable[[], bool]
+        self, number: int, path: str, search: Search, maps: list[Given], given_up: Callable[[], bool]
     ) -> contextlib.AbstractContextManager[object]:
         """What answers in time, in a process that does nothing else, where the search cannot be ended."""
 
         def last_words(why: SearchStop) -> tuple[Answer, int]:
             solution = search.snapshot(why)
-            found = [*maps] or [ssh_map.to_dict() for ssh_map in solution.maps if self.json]
+            found = [*maps] or ([(ssh_map, None) for ssh_map in solution.maps] if self.json else [])
             return self._told(number, path, search, solution, found, None, None), EXIT_ERROR  # of the process, which nobody reads
 
         if not workers.serves():
@@ -142,13 +157,14 @@ class Question:
         path: str,
         search: Search,
         solution: Solution,
-        maps: Sequence[dict[str, Any]],
+        maps: Sequence[Given],
         explanation: Explanation | None,
         backbone: Backbone | None,
     ) -> Answer:
         if self.json:
             count = len(maps)
-            line = dump({"trace": path, **opening(search), "maps": maps, **ending(search, solution, explanation, count, backbone)})
+            maps_told = list(map(told, maps))
+            line = dump({"trace": path, **opening(search), "maps": maps_told, **ending(search, solution, explanation, count, backbone)})
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
         return Answer(number, line, exit_code(solution), tuple(warnings_of(search, solution)))

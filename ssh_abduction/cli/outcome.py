@@ -7,9 +7,11 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from itertools import zip_longest
+from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
+from ssh_abduction.engines.base import Cost
 from ssh_abduction.explain import Explanation, Interrupted, explain
 from ssh_abduction.files import json_line
 from ssh_abduction.maps import SSHMap
@@ -18,6 +20,8 @@ from ssh_abduction.solver import Search, Solution, Status, result
 from ssh_abduction.solver.sharing import Backbone
 
 SOON = 10_000  # steps of a trace in which noise is sought after Ctrl-C, at most: in 40,000 that takes two seconds
+
+Given: TypeAlias = tuple[SSHMap, Cost | None]
 
 LEAST_LEFT = 0.2  # seconds of a time limit, with less of which the runner-up is not looked at
 
@@ -50,9 +54,20 @@ def opening(search: Search) -> dict[str, Any]:
     return result.opening(search.theory, len(search.trace), search.within)
 
 
-def told(search: Search, ssh_map: SSHMap) -> dict[str, Any]:
-    """What the JSON of a solution says of the map that was given last: also what it costs, where not all maps cost the same."""
-    return result.written_map(ssh_map, search.cost if search.within else None)
+def told(given: Given) -> dict[str, Any]:
+    """What the JSON of a solution says of a map: also what it costs, where not all maps cost the same."""
+    ssh_map, cost = given
+    return result.written_map(ssh_map, cost)
+
+
+def given_by(search: Search, ssh_map: SSHMap) -> Given:
+    """The map that a search gave last, and what it costs, where not all maps cost the same."""
+    return ssh_map, search.cost if search.within else None
+
+
+def all_given(solution: Solution) -> list[Given]:
+    """The same of all maps of a solution, in its order."""
+    return list(zip_longest(solution.maps, solution.costs if solution.within else ()))
 
 
 def ending(search: Search, solution: Solution, explanation: Explanation | None, maps: int, backbone: Backbone | None) -> dict[str, Any]:

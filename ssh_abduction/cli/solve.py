@@ -14,8 +14,21 @@ from typing import Any
 from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
-from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, on_ctrl_c, opening, told, warn, warnings_of
-from ssh_abduction.cli.text import by_displacements, describe, describe_backbone, differences, headline
+from ssh_abduction.cli.outcome import (
+    Given,
+    all_given,
+    dump,
+    ending,
+    exit_code,
+    explained,
+    given_by,
+    on_ctrl_c,
+    opening,
+    told,
+    warn,
+    warnings_of,
+)
+from ssh_abduction.cli.text import by_displacements, compared, describe, describe_backbone, headline
 from ssh_abduction.explain import Explanation
 from ssh_abduction.logs import PROGRESS
 from ssh_abduction.maps import SSHMap
@@ -25,8 +38,10 @@ from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 from ssh_abduction.trace import Trace
 
-# So many maps are compared on the terminal, as more cannot be taken in there; --json has all.
-SHOWN = 4
+# So many maps are compared on the terminal, at most, and so many are put in order in JSON: of more the first ones found are compared, and all are printed as found.
+HELD = 1000
+# And maps of so many dstates together, so that they take some 100 MB at most.
+HELD_DSTATES = 500_000
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -104,12 +119,14 @@ class _Text:
     def __init__(self, search: Search) -> None:
         self.kept: list[SSHMap] = []
         self._search = search
+        self._room = HELD_DSTATES
 
     def searched(self, _: Callable[[Callable[[], str]], None]) -> Explanation | None:
         """Search, and explain why there is no map, if that is so."""
         for ssh_map in self._search:
-            if len(self.kept) < SHOWN:
+            if len(self.kept) < HELD and self._room > 0:
                 self.kept.append(ssh_map)
+                self._room -= len(ssh_map.dstates)
         return explained(self._search)
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
@@ -125,25 +142,38 @@ class _Text:
 
 
 class _Json:
-    """What is printed of a search for programs: the maps, one a line, as they come; none is kept."""
-
-    kept: tuple[SSHMap, ...] = ()
+    """What is printed of a search for programs: the maps, one a line. They are held until they can be put in order; where they are too many, all are printed as they come."""
 
     def __init__(self, search: Search) -> None:
         self._search = search
+        self._held: list[Given] = []
+        self._room = HELD_DSTATES
         self._maps = 0  # that were printed
         self._begun = False
 
+    @property
+    def kept(self) -> list[SSHMap]:
+        """The maps that are held: all, or none."""
+        return [ssh_map for ssh_map, _ in self._held]
+
     def searched(self, say: Callable[[Callable[[], str]], None]) -> Explanation | None:
-        """Print the maps as they are found, and explain why there is none, if that is so."""
+        """Hold the maps, or print them as they are found, and explain why there is none, if that is so."""
         say(self._opening)
         for ssh_map in self._search:
-            say(partial(self._line, ssh_map))
+            given = given_by(self._search, ssh_map)
+            if self._maps:
+                say(partial(self._line, given))
+                continue
+            self._held.append(given)
+            self._room -= len(ssh_map.dstates)
+            if len(self._held) > HELD or self._room < 0:
+                say(self._let_go)
         return explained(self._search)
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
-        """What comes after the maps."""
-        return self._end(solution, explanation, self._search.backbone)
+        """The maps that are held, and what comes after them."""
+        maps = "".join(map(self._line, all_given(solution)))
+        return maps + self._end(solution, explanation, self._search.backbone)
 
     def _end(self, solution: Solution, explanation: Explanation | None, backbone: Backbone | None) -> str:
         return "\n]," + dump(ending(self._search, solution, explanation, self._maps, backbone))[1:] + "\n"
@@ -152,9 +182,9 @@ class _Json:
         """What is missing, with what is known, where the search cannot be ended in time, and the exit code."""
         solution = self._search.snapshot(why)
         warn(warnings_of(self._search, solution))
-        words = "" if self._begun else self._opening()
+        words = ("" if self._begun else self._opening()) + self._let_go()
         if not self._maps and solution.maps:
-            words += self._line(solution.maps[0])
+            words += self._line((solution.maps[0], None))
         # The backbone is not asked for, which another thread may be changing.
         return words + self._end(solution, None, None), exit_code(solution)
 
@@ -162,9 +192,14 @@ class _Json:
         self._begun = True
         return dump(opening(self._search))[:-1] + ', "maps": ['
 
-    def _line(self, ssh_map: SSHMap) -> str:
+    def _let_go(self) -> str:
+        """The maps that are held, in the order in which they were found."""
+        held, self._held = self._held, []
+        return "".join(map(self._line, held))
+
+    def _line(self, given: Given) -> str:
         self._maps += 1
-        return ("," if self._maps > 1 else "") + "\n" + dump(told(self._search, ssh_map))
+        return ("," if self._maps > 1 else "") + "\n" + dump(told(given))
 
 
 def _text(lines: Iterator[str]) -> str:
@@ -190,8 +225,12 @@ def _lines(search: Search, solution: Solution, explanation: Explanation | None, 
     if backbone and not solution.minimal_listed:
         yield describe_backbone(backbone, search.trace)
     if len(solution.maps) > 1:
-        some = "" if search.count <= SHOWN else f" (the first {SHOWN}; --json lists all)"
-        yield f"\nwhat tells the maps apart{some}\n{differences(solution.maps, search.trace)}"
+        from ssh_abduction.rivals.compare import compare
+        from ssh_abduction.rivals.listing import Listing
+
+        some = "" if search.count == len(solution.maps) else f" (of the first {len(solution.maps)} found)"
+        yield f"\nwhat tells the maps apart{some}"
+        yield from compared(compare(Listing(solution.maps)))
 
 
 @contextlib.contextmanager

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from ssh_abduction.errors import printable
 from ssh_abduction.explain import Explanation
@@ -14,8 +15,20 @@ from ssh_abduction.theory.evidence import evidence_of
 from ssh_abduction.trace import Trace
 from ssh_abduction.words import counted as counted  # noqa: PLC0414 - the verbs have it from here
 
+if TYPE_CHECKING:
+    from ssh_abduction.rivals.compare import Comparison, Matter
+
 # So many pairs of steps are told of, at most, as more cannot be taken in on a terminal.
 SHOWN_PAIRS = 12
+# So many questions of one choice, and so many ways to answer them, are told of, at most.
+SHOWN_QUESTIONS, SHOWN_OPTIONS = 12, 12
+PLURALS: dict[Matter, str] = {
+    "faults": "faults",
+    "dstates": "dstates",
+    "places": "places",
+    "paths": "paths",
+    "courses": "directions along paths",
+}
 
 
 def headline(solution: Solution, count: int, explanation: Explanation | None) -> str:
@@ -115,31 +128,48 @@ def describe_backbone(backbone: Backbone, trace: Trace) -> str:
     return "\n".join(parts)
 
 
+def compared(found: Comparison) -> Iterator[str]:
+    """What maps differ in, choice by choice, and which questions decide. Nothing where they do not differ."""
+    number = {question: i for i, question in enumerate(found.deciding, 1)}
+    if found.product:
+        yield f"  {found.product}: these choices are independent of each other"
+    for choice in found.choices:
+        yield f"  {counted(len(choice.options), 'ways')}: {depending(choice.differing)}"
+        asked = sorted(choice.questions, key=number.__getitem__)
+        for question in asked[:SHOWN_QUESTIONS]:
+            yes = [i for option in choice.options if option.answers[choice.questions.index(question)] for i in option.maps]
+            yield f"    {number[question]}. {question}: in {_numbered(sorted(yes), len(found.ids))}"
+        if len(asked) > SHOWN_QUESTIONS:
+            yield f"    and {counted(len(asked) - SHOWN_QUESTIONS, 'more questions')}; --json has them"
+        if 1 < len(asked) <= SHOWN_QUESTIONS and len(choice.options) <= SHOWN_OPTIONS:
+            order = [choice.questions.index(question) for question in asked]
+            rows = [[*("yes" if option.answers[k] else "no" for k in order), stretches(option.maps)] for option in choice.options]
+            yield "\n".join(f"    {line}" for line in table([*(f"{number[q]}." for q in asked), "maps"], rows).splitlines())
+    if found.together:
+        yield f"  several of these together: {depending(found.together)}"
+    if not found.deciding:
+        return
+    causes = sum(question.sort in ("faults", "dstates") for question in found.deciding)
+    told = "question 1 tells" if len(found.deciding) == 1 else f"questions 1 to {len(found.deciding)}, in this order, tell"
+    some = f", and 1 to {causes} the {found.variants['dstates']} labelings" if 0 < causes < len(found.deciding) else ""
+    yield f"  which steps decide: {told} all {counted(len(found.ids), 'maps')} apart{some}"
+
+
+def depending(differing: Mapping[Matter, Sequence[int]]) -> str:
+    """The dstates of steps 48 and 51; the paths of step 66."""
+    shown = {sort: steps for sort, steps in differing.items() if sort != "courses" or not set(steps) <= set(differing.get("paths", ()))}
+    return "; ".join(f"the {PLURALS[sort]} of {told_steps(steps)}" for sort, steps in shown.items())
+
+
+def _numbered(numbers: Sequence[int], count: int) -> str:
+    return f"{'map' if len(numbers) == 1 else 'maps'} {stretches(numbers)} ({len(numbers)} of {count})"
+
+
+def told_steps(steps: Sequence[int]) -> str:
+    """step 40; steps 12–15 and 40."""
+    return f"{'step' if len(steps) == 1 else 'steps'} {stretches(steps)}"
+
+
 def course(path: int | None, direction: int | None) -> str:
     """A path and the direction along it: 2+ or 2-."""
     return "" if path is None else f"{path}{'+' if direction == 1 else '-'}"
-
-
-def differences(maps: Sequence[SSHMap], trace: Trace) -> str:
-    """The steps at which the maps disagree, and on what. A dstate, place or path, or a path in one direction, is named by the first step at it."""
-    named = [_named(ssh_map) for ssh_map in maps]
-    rows: list[list[object]] = []
-    for t, step in enumerate(trace.steps):
-        differing = False
-        for i, sort in enumerate(("dstate", "place", "path", "direction")):
-            cells = [names[t][i] for names in named]
-            if len(set(cells)) > 1 and not (sort == "direction" and differing):  # along another path is along another direction of one
-                differing = sort == "path"
-                rows.append([t, step.view, sort, *("none" if c is None else "new" if c == t else f"of step {c}" for c in cells)])
-    return table(["step", "view", "", *(f"map {i + 1}" for i in range(len(maps)))], rows)
-
-
-def _named(ssh_map: SSHMap) -> list[tuple[int | None, ...]]:
-    """For each step the first steps at its dstate, at its place, along its path, and along that in its direction."""
-    first: dict[tuple[str, object], int] = {}
-    found: list[tuple[int | None, ...]] = []
-    for t, label in enumerate(ssh_map.labels):
-        s = ssh_map.dstates[label]
-        names = (("dstate", s.id), ("place", s.place), ("path", s.path), ("direction", None if s.path is None else (s.path, s.direction)))
-        found.append(tuple(None if name is None else first.setdefault((sort, name), t) for sort, name in names))
-    return found

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain, islice
 from typing import TypeAlias
 
 from ssh_abduction.maps import Fit, SSHMap
@@ -53,6 +54,26 @@ class Ranking:
                 break
         yield from sorted(held, key=lambda m: m.fit.chi2 if m.fit else math.inf)
         yield from (ssh_map if over() else self.fitted(ssh_map) for ssh_map in maps)
+
+
+def in_order(maps: Sequence[SSHMap], counts: Iterable[int]) -> tuple[SSHMap, ...]:
+    """Maps in an order that is the same in each run, whatever order they are found in: those that close best first, and of equal ones by their labels, then by their
+    places, then by their courses, each as numbered by first visit.
+
+    counts  how many maps there are of each level; each level is put in order by itself, and what is beyond stays as it is
+    """
+    left = iter(maps)
+    levels = [sorted(islice(left, count), key=_order) for count in counts]
+    return tuple(chain(*levels, left))
+
+
+def _order(ssh_map: SSHMap) -> tuple[object, ...]:
+    dstates = ssh_map.dstates
+    places, paths = (
+        [-1 if number is None else number for number in numbers] for numbers in zip(*((s.place, s.path) for s in dstates), strict=True)
+    )
+    faults = [(f.step, f.kind, str(f.seen), str(f.expected)) for f in ssh_map.faults]
+    return ssh_map.fit.chi2 if ssh_map.fit else math.inf, ssh_map.labels, places, paths, [s.direction or 0 for s in dstates], faults
 
 
 def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:

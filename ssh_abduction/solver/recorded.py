@@ -45,7 +45,7 @@ class Recorded:
         return cls(
             certificate=None if written is None else _certificate(read, written, steps),
             written_certificate=written,
-            backbone=None if record.get("backbone") is None else Backbone.from_dict(record["backbone"], steps, read.where),
+            backbone=None if record.get("backbone") is None else Backbone.from_dict(record["backbone"], steps, f"{read.where}: backbone"),
             listed=record.get("minimal_listed", record.get("complete")) is True,
             warnings=tuple(warnings),
             explanation=None if record.get("explanation") is None else read.mapping(record["explanation"], "explanation"),

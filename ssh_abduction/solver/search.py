@@ -63,7 +63,7 @@ from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.solver.ranking import Ranking, noise_warning, units_warning
+from ssh_abduction.solver.ranking import Ranking, in_order, noise_warning, units_warning
 from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solution, Status
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.steps.certificate import Basis
@@ -549,7 +549,11 @@ class Search:
         return False
 
     def solution(self, maps: tuple[SSHMap, ...] = ()) -> Solution:
-        """How the search ended, with the maps that the caller kept."""
+        """How the search ended, with the maps that the caller kept. If these are all that were given, and no minimal map is missing, they are put in an order that is
+        the same in each run (`solver/ranking.py`).
+        """
+        if self._known.complete or self._rivals.listed:
+            maps = self._in_order(maps)
         return self._solution(maps, self.grounding)
 
     def _solution(self, maps: tuple[SSHMap, ...], grounding: Grounding) -> Solution:
@@ -578,6 +582,18 @@ class Search:
             evidence=said_by(evidence_of(self.theory), self.trace, self._known.refused),
             odometry_warning=(units_warning(self.trace) or noise_warning(self._first.fit)) if self._first and self._first.fit else None,
         )
+
+    def _in_order(self, maps: tuple[SSHMap, ...]) -> tuple[SSHMap, ...]:
+        """All maps that were given, in their order; each level costs what its first map does."""
+        if not maps or len(maps) < sum(level.count for level in self._levels):
+            return maps
+        ordered = in_order(maps, [level.count for level in self._levels])
+        begin = 0
+        for i, level in enumerate(self._levels):
+            cost = level.cost.preferred_by(self.theory)
+            self._levels[i] = replace(level, cost=cost_as_counted(ordered[begin], cost, self.theory))
+            begin += level.count
+        return ordered
 
     def snapshot(self, stopped: Stop) -> Solution:
         """What is known while the search is still under way in another thread that cannot be stopped. The program ends then: it is of no use any more.

@@ -15,12 +15,13 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, Literal, TypeAlias
 
 from ssh_abduction.engines.doubts import Sort
-from ssh_abduction.maps import DState, FieldReader, SSHMap
+from ssh_abduction.errors import MapError, brief, is_whole
+from ssh_abduction.maps import DState, SSHMap
 from ssh_abduction.words import counted
 
 Pair: TypeAlias = tuple[int, int]
@@ -40,6 +41,7 @@ class Shared:
 
     always     a number for each step. Steps of one number are one in all maps; the numbers are those of the first steps that have them, in order
     sometimes  pairs of steps that are one in some maps and not in others. Each step stands for all of its number, and is the first of these
+    untold     where a file has only some of the pairs (PRINTED): the steps in which the maps differ, all the same
 
     Steps of any other two numbers are one in no map. Where a dstate is along no path, its steps have a number that no others have; a pair of a step with
     itself says that it is along some path in some maps, and along none in others.
@@ -47,6 +49,7 @@ class Shared:
 
     always: tuple[int, ...]
     sometimes: tuple[Pair, ...]
+    untold: tuple[int, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
         pairs = f"; {counted(len(self.sometimes), 'pairs')} of steps differ" if self.sometimes else ""
@@ -62,25 +65,14 @@ class Shared:
     @property
     def differing(self) -> tuple[int, ...]:
         """The steps in which the maps differ: those which are one with an earlier step in some maps and not in others, and all that go with these."""
+        if self.untold:
+            return self.untold
         numbers = {self.always[later] for _, later in self.sometimes}
         return tuple(t for t, number in enumerate(self.always) if number in numbers)
 
-    @classmethod
-    def read(cls, read: FieldReader, data: Any, name: str, which: Sequence[int]) -> Shared:
-        """What `to_dict` wrote. `which` of its numbers is that of each step. Raises MapError."""
-        record = read.mapping(data, name)
-        numbers = [read.integer(number, f"{name}.always[{i}]") for i, number in enumerate(read.list(record, "always"))]
-        if len(numbers) != max(which) + 1:
-            raise read.wrong(f"{name}.always", f"{max(which) + 1} numbers", len(numbers))
-        pairs = tuple(read.pair(pair, f"{name}.sometimes[{i}]") for i, pair in enumerate(read.list(record, "sometimes")))
-        for i, pair in enumerate(pairs):
-            if not 0 <= min(pair) <= max(pair) < len(which):
-                raise read.wrong(f"{name}.sometimes[{i}]", f"two steps from 0 to {len(which) - 1}", list(pair))
-        return cls(tuple(numbers[i] for i in which), pairs)
-
     def to_dict(self, steps: Iterable[int]) -> dict[str, Any]:
-        """The numbers of these steps, and the pairs: if there are more than PRINTED, as many of them, and their count."""
-        more = {"pairs": len(self.sometimes)} if len(self.sometimes) > PRINTED else {}
+        """The numbers of these steps, and the pairs: if there are more than PRINTED, as many of them, their count, and the steps in which the maps differ."""
+        more = {"pairs": len(self.sometimes), "differing": list(self.differing)} if len(self.sometimes) > PRINTED else {}
         return {"always": [self.always[t] for t in steps], "sometimes": [list(pair) for pair in self.sometimes[:PRINTED]], **more}
 
 
@@ -128,20 +120,14 @@ class Backbone:
         return {"proven": self.proven, **told}
 
     @classmethod
-    def from_dict(cls, data: Any, steps: int, where: str = "backbone") -> Backbone | None:
-        """The backbone that `to_dict` made plain data of, for so many steps; None where some pairs were left out there. Raises MapError.
-
-        where  how messages call what it is from
-        """
-        read = FieldReader(where)
-        record = read.mapping(data, "backbone")
-        if not isinstance(record.get("proven"), bool):
-            raise read.wrong("backbone.proven", "true or false", record.get("proven"))
-        labels = Shared.read(read, record.get("dstates"), "backbone.dstates", tuple(range(steps)))
-        others = {sort: Shared.read(read, record[sort], f"backbone.{sort}", labels.always) for sort in SORTS[1:] if sort in record}
-        if any("pairs" in record[sort] for sort in SORTS if sort in record):
-            return None
-        return cls(labels, others.get("places"), others.get("paths"), others.get("courses"), record["proven"])
+    def from_dict(cls, data: Any, steps: int, where: str = "backbone") -> Backbone:
+        """What `to_dict` wrote, for a trace of so many steps. Raises MapError with the field that is wrong."""
+        if not isinstance(data, Mapping) or not isinstance(data.get("proven"), bool) or "dstates" not in data:
+            raise MapError(f"{where}: expected an object with proven and dstates, got {brief(data)}; write it with solve --json")
+        dstates = _read_shared(data["dstates"], None, steps, f"{where}: dstates")
+        of_step = dstates.always
+        rest = {sort: _read_shared(data[sort], of_step, steps, f"{where}: {sort}") for sort in SORTS[1:] if sort in data}
+        return cls(dstates, rest.get("places"), rest.get("paths"), rest.get("courses"), data["proven"])
 
 
 class Sharing:
@@ -261,6 +247,25 @@ class Kept:
         for some in members.values():
             self.together.update((i, i) for i in some)
             self.together.update(combinations(some, 2))
+
+
+def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: str) -> Shared:
+    """What a file says of one sort: its numbers are of steps or, where a number of each step is given, of these."""
+    expected = steps if of_step is None else len(set(of_step))
+    always = data.get("always") if isinstance(data, Mapping) else None
+    if not isinstance(always, list) or len(always) != expected or not all(is_whole(n) and n >= 0 for n in always):
+        raise MapError(f"{where}.always: expected {expected} numbers, got {brief(always)}; write it with solve --json")
+    pairs, told = data.get("sometimes"), data.get("differing", [])
+    if not isinstance(pairs, list) or not all(isinstance(pair, list) and len(pair) == 2 and _are_steps(pair, steps) for pair in pairs):
+        raise MapError(f"{where}.sometimes: expected pairs of steps, 0 to {steps - 1}, got {brief(pairs)}; write it with solve --json")
+    if not isinstance(told, list) or not _are_steps(told, steps):
+        raise MapError(f"{where}.differing: expected steps, 0 to {steps - 1}, got {brief(told)}; write it with solve --json")
+    by_step = tuple(always if of_step is None else (always[number] for number in of_step))
+    return Shared(by_step, tuple((i, j) for i, j in pairs), tuple(told))
+
+
+def _are_steps(values: Sequence[Any], steps: int) -> bool:
+    return all(is_whole(t) and 0 <= t < steps for t in values)
 
 
 def _split(together: Iterable[Pair], parts: Mapping[int, Sequence[int]]) -> Iterator[Pair]:

@@ -1,0 +1,73 @@
+"""ssh-abduction compare MAPS [OTHER]: what rival maps share, where they differ, and which steps decide."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.text import compared, counted, depending
+from ssh_abduction.errors import printable
+from ssh_abduction.files import json_line
+
+if TYPE_CHECKING:
+    from ssh_abduction.rivals.compare import Comparison
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = "Compare the minimal maps of a trace: what do all of them share, where do they differ, and which steps decide between them?"
+    parser = verbs.add_parser("compare", help="what do rival maps share, and where do they differ?", description=text)
+    parser.add_argument("maps", help="what solve --json printed, or one saved map; - for standard input")
+    parser.add_argument(
+        "other", nargs="?", help="maps of the same trace to compare with: which maps are in both, and how do the first ones differ?"
+    )
+    diff = "instead, tell two maps apart in words, each by its number, from 1, or its id; with OTHER, the second one is of that file"
+    parser.add_argument("--diff", nargs=2, metavar=("I", "J"), help=diff)
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=run)
+    parser.epilog = (
+        "Questions that decide are chosen greedily: none can be left out, but there may be fewer. docs/formats.md says what the JSON has."
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    from ssh_abduction.rivals.compare import compare  # which loads numpy
+    from ssh_abduction.rivals.difference import difference
+    from ssh_abduction.rivals.listing import Listing
+
+    listing = Listing.load(options.maps)
+    other = Listing.load(options.other) if options.other is not None else None
+    if options.diff:
+        there = other or listing
+        listing.check_same_trace(there)
+        i, j = listing.number(options.diff[0]), there.number(options.diff[1])
+        names = f"map {i + 1}", f"map {j + 1}" + (f" of {printable(other.source)}" if other else "")
+        told = difference(listing.maps[i], there.maps[j], names)
+        print(json_line(told.to_dict()) if options.json else told)
+        return 0
+    found = compare(listing, other)
+    print(json_line(found.to_dict()) if options.json else "\n".join(_lines(found)))
+    return 0
+
+
+def _lines(found: Comparison) -> Iterator[str]:
+    yield found.sentence
+    if len(found.ids) > 1:
+        if found.complete is False:
+            yield f"of the {counted(len(found.ids), 'maps')} listed: {found.listed.sentence}"
+        yield from compared(found)
+    if len(found.sizes) > 1:
+        yield from (
+            f"  {counted(count, 'maps')} with {counted(dstates, 'dstates')}, {counted(places, 'places')}, {counted(paths, 'paths')}"
+            for (dstates, places, paths), count in found.sizes
+        )
+    if found.fits and found.fits[0] != found.fits[1]:
+        yield f"  they close with chi-squares of {found.fits[0]:.1f} to {found.fits[1]:.1f}"
+    if found.unlisted:
+        yield f"  only in maps that are not listed: {depending(found.unlisted)}"
+    if found.others:
+        yield found.others.sentence
+        if not found.others.best.same:
+            yield "the first maps of both differ:"
+            yield from (f"  {line}" for line in found.others.best.lines)

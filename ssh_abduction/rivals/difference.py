@@ -1,0 +1,219 @@
+"""What tells two maps of one trace apart.
+
+>>> from ssh_abduction.maps import DState, SSHMap
+>>> a, b = DState(0, "hall"), DState(1, "hall")
+>>> found = difference(SSHMap((0, 0, 1), (a, b), ()), SSHMap((0, 1, 1), (a, b), ()))
+>>> print(found)
+dstates: in the first map steps 0–1 | 2 are two, in the other one steps 0 | 1–2 are two
+
+The steps of a dstate in one map may be at several dstates in the other one, whose steps may be at further dstates of the first one. What hangs together so
+is one `Change`, and all else is the same in both maps. Places, paths and courses are compared likewise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, TypeAlias
+
+import networkx as nx
+
+from ssh_abduction.engines.doubts import Sort
+from ssh_abduction.errors import MapError, printable
+from ssh_abduction.maps import Fault, SSHMap
+from ssh_abduction.rivals.table import NONE, Table
+from ssh_abduction.solver.sharing import stretches
+
+Steps: TypeAlias = tuple[int, ...]
+Link: TypeAlias = tuple[int, str, int]
+
+NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+SORTED_BY = {"dstates": "dstates", "places": "places", "paths": "paths", "courses": "directions along paths"}
+# So many changes of a sort, and so many links, are told in words, at most.
+TOLD = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Steps which two maps group differently: by dstate, place, path or course.
+
+    sort   what they are grouped by
+    first  the groups of the first map, by their first steps
+    other  the groups of the other map
+    first_none, other_none  steps that are along no path, or at no place, in that map
+    """
+
+    sort: Sort
+    first: tuple[Steps, ...]
+    other: tuple[Steps, ...]
+    first_none: Steps = ()
+    other_none: Steps = ()
+
+    def told(self, names: tuple[str, str]) -> str:
+        """The change in words, where the two maps are called so."""
+        sides = ((self.first, self.first_none), (self.other, self.other_none))
+        return ", ".join(f"in {name} {_told(*side)}" for name, side in zip(names, sides, strict=True))
+
+    def to_dict(self) -> dict[str, Any]:
+        data: dict[str, Any] = {"sort": self.sort, "first": [list(g) for g in self.first], "other": [list(g) for g in self.other]}
+        if self.first_none or self.other_none:
+            data |= {"first_none": list(self.first_none), "other_none": list(self.other_none)}
+        return data
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """What tells two maps of one trace apart.
+
+    ids      the ids of both maps
+    names    what the maps are called in words
+    sizes    for both maps how many dstates, places, paths and links they have
+    changes  steps that are grouped differently
+    links    for both maps the links that only it has, of those between dstates that are the same in both. A dstate is named by its first step
+    faults   for both maps what only it disbelieves
+    chi2     for both maps how well it closes, where both have a fit
+    has_places  for both maps whether it has places
+    """
+
+    ids: tuple[str, str]
+    names: tuple[str, str]
+    sizes: tuple[tuple[int, int, int, int], tuple[int, int, int, int]]
+    changes: tuple[Change, ...]
+    links: tuple[tuple[Link, ...], tuple[Link, ...]]
+    faults: tuple[tuple[Fault, ...], tuple[Fault, ...]]
+    chi2: tuple[float, float] | None = None
+    has_places: tuple[bool, bool] = (True, True)
+
+    @property
+    def same(self) -> bool:
+        """Whether the maps are the same up to renaming."""
+        return self.ids[0] == self.ids[1]
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The difference in words, cause first."""
+        told = []
+        counts = zip(("dstates", "places", "paths", "links"), *self.sizes, strict=True)
+        if unequal := [f"{a} {name} against {b}" for name, a, b in counts if a != b]:
+            told.append(f"size: {self.names[0]} has {', '.join(unequal)} of {self.names[1]}")
+        for name, faults in zip(self.names, self.faults, strict=True):
+            told += [f"faults: only in {name} {printable(str(fault))}" for fault in faults]
+        for sort, word in SORTED_BY.items():
+            changes = [change for change in self.changes if change.sort == sort]
+            told += [f"{word}: {change.told(self.names)}" for change in changes[:TOLD]]
+            if len(changes) > TOLD:
+                told.append(f"{word}: {len(changes) - TOLD} more changes")
+        for name, links in zip(self.names, self.links, strict=True):
+            some = [f"{printable(action)} from the dstate of step {s} to that of step {x}" for s, action, x in links[:TOLD]]
+            more = f", and {len(links) - TOLD} more" if len(links) > TOLD else ""
+            told += [f"links: only in {name} {', '.join(some)}{more}"] if some else []
+        if any(self.has_places) and not all(self.has_places):
+            told.append(f"places and paths: only in {self.names[self.has_places.index(True)]}")
+        if self.chi2 and self.chi2[0] != self.chi2[1]:
+            told.append(f"fit: a chi-square of {self.chi2[0]:.1f} for {self.names[0]}, {self.chi2[1]:.1f} for {self.names[1]}")
+        return tuple(told)
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines) or "the maps are the same"
+
+    def to_dict(self) -> dict[str, Any]:
+        """As `compare --diff --json` prints it (docs/formats.md)."""
+        sizes = [dict(zip(("dstates", "places", "paths", "links"), size, strict=True)) for size in self.sizes]
+        data: dict[str, Any] = {
+            "ids": list(self.ids),
+            "same": self.same,
+            "sizes": sizes,
+            "changes": [change.to_dict() for change in self.changes],
+            "links": [[list(link) for link in links] for links in self.links],
+            "has_places": list(self.has_places),
+            "faults": [[{k: v for k, v in asdict(fault).items() if v is not None} for fault in faults] for faults in self.faults],
+            "words": list(self.lines),
+        }
+        if self.chi2:
+            data["chi2"] = list(self.chi2)
+        return data
+
+
+def difference(first: SSHMap, other: SSHMap, names: tuple[str, str] = ("the first map", "the other one")) -> Difference:
+    """What tells two maps of one trace apart. Raises MapError where they have other numbers of steps.
+
+    names  what the maps are called in words
+    """
+    if len(first.labels) != len(other.labels):
+        raise MapError(f"maps: expected two of one trace, got one of {len(first.labels)} steps and one of {len(other.labels)}")
+    first, other = first.renumbered(), other.renumbered()
+    table = Table([first, other])
+    changes: list[Change] = []
+    for sort in table.ones:
+        found = list(_changes(table, sort))
+        if sort == "courses":  # a step along another path is along another course
+            moved = {t for change in changes if change.sort == "paths" for group in (*change.first, *change.other) for t in group}
+            found = [change for change in found if moved.isdisjoint(t for group in (*change.first, *change.other) for t in group)]
+        changes += found
+    links = (_named_links(first), _named_links(other))
+    unmoved = _unmoved(first, other)
+    only = [tuple(sorted(k for k in mine - theirs if k[0] in unmoved and k[2] in unmoved)) for mine, theirs in (links, links[::-1])]
+    faults = [tuple(f for f in mine.faults if f not in theirs.faults) for mine, theirs in ((first, other), (other, first))]
+    return Difference(
+        ids=(first.id, other.id),
+        names=names,
+        sizes=(_size(first), _size(other)),
+        changes=tuple(changes),
+        links=(only[0], only[1]),
+        faults=(faults[0], faults[1]),
+        chi2=(first.fit.chi2, other.fit.chi2) if first.fit and other.fit else None,
+        has_places=(bool(first.places), bool(other.places)),
+    )
+
+
+def _changes(table: Table, sort: Sort) -> Iterable[Change]:
+    """The classes that two maps group differently, in the order of their first steps."""
+    ones = table.ones[sort]
+    linked: nx.Graph[int] = nx.Graph()
+    linked.add_nodes_from(range(ones.shape[1]))
+    for row in ones.tolist():
+        linked.add_edges_from((c, one) for c, one in enumerate(row) if one != NONE)
+    for classes in sorted(map(sorted, nx.connected_components(linked))):
+        if (ones[0, classes] != ones[1, classes]).any():
+            first, other = (tuple(table.steps_of(group) for group in _groups(classes, row.tolist())) for row in ones)
+            nowhere = [table.steps_of([c for c in classes if row[c] == NONE]) for row in ones]
+            yield Change(sort, first, other, nowhere[0], nowhere[1])
+
+
+def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
+    groups: dict[int, list[int]] = {}
+    for c in classes:
+        if ones[c] != NONE:
+            groups.setdefault(ones[c], []).append(c)
+    return list(groups.values())
+
+
+def _named_links(ssh_map: SSHMap) -> set[Link]:
+    """The links, each dstate named by its first step."""
+    first: dict[int, int] = {}
+    for t, label in enumerate(ssh_map.labels):
+        first.setdefault(label, t)
+    return {(first[s], action, first[x]) for s, action, x in ssh_map.links if s in first and x in first}
+
+
+def _unmoved(first: SSHMap, other: SSHMap) -> set[int]:
+    """The first steps of dstates that have the same steps in both maps."""
+    sets: list[set[Steps]] = []
+    for ssh_map in (first, other):
+        steps: dict[int, list[int]] = {}
+        for t, label in enumerate(ssh_map.labels):
+            steps.setdefault(label, []).append(t)
+        sets.append({tuple(some) for some in steps.values()})
+    return {some[0] for some in sets[0] & sets[1]}
+
+
+def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
+    return len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.links)
+
+
+def _told(groups: Sequence[Steps], none: Steps) -> str:
+    steps = [t for group in groups for t in group]
+    number = NUMBERS[len(groups)] if len(groups) < len(NUMBERS) else str(len(groups))
+    told = f"{'step' if len(steps) == 1 else 'steps'} {' | '.join(map(stretches, groups))} {'is' if len(steps) == 1 else 'are'} {number}"
+    off = f"{'step' if len(none) == 1 else 'steps'} {stretches(none)} {'is' if len(none) == 1 else 'are'} none"
+    return " and ".join(([told] if groups else []) + ([off] if none else []))

@@ -1,0 +1,179 @@
+"""Maps of one trace as they are listed, and what is known of those that are not: of a solution, of a file, or of maps alone.
+
+>>> from ssh_abduction.maps import DState, SSHMap
+>>> one = SSHMap((0, 0), (DState(0, "hall"),), ())
+>>> Listing.of([one]).steps
+2
+>>> Listing.of([one, SSHMap((0,), (DState(0, "hall"),), ())])
+Traceback (most recent call last):
+ssh_abduction.errors.MapError: maps[1]: expected 2 steps, as maps[0] has, got 1; compare maps of one trace
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+from ssh_abduction.errors import MapError, brief, is_whole, named
+from ssh_abduction.maps import ID_LENGTH, SSHMap, maps_of, read_json
+from ssh_abduction.solver.result import Solution, Status
+from ssh_abduction.solver.sharing import Backbone
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import View
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """Maps of one trace, and what is known of the others.
+
+    maps      the maps, in the order in which they are listed
+    minimal   how many of them, from the first one on, are minimal, as was proven; None where nobody says so
+    complete  whether no further minimal map exists; None where nobody says so
+    stopped   why listing ended before it was complete, where that is known
+    backbone  what all minimal maps share, as far as it was found out by reasoning or from all maps; None where that is not known
+    source    where the maps are from, as messages name it
+    """
+
+    maps: tuple[SSHMap, ...]
+    minimal: int | None = None
+    complete: bool | None = None
+    stopped: str | None = None
+    backbone: Backbone | None = field(default=None, repr=False)
+    source: str = "maps"
+
+    @property
+    def steps(self) -> int:
+        """How many steps the trace has."""
+        return len(self.maps[0].labels)
+
+    @classmethod
+    def of(cls, source: Maps) -> Listing:
+        """What a solution lists, or maps alone. Raises MapError for maps of several traces, and for none."""
+        if isinstance(source, Listing):
+            return source
+        if isinstance(source, Solution):
+            minimal = (source.levels[0].count if source.levels else source.count) if source.status is Status.OPTIMAL else None
+            backbone = source.backbone if source.maps else None
+            listing = cls(source.maps, minimal, source.minimal_listed, source.stopped, backbone)
+            return listing.checked(one_view=_has_one_view(source.theory))
+        if isinstance(source, SSHMap):
+            source = [source]
+        if isinstance(source, str | os.PathLike | Mapping) or not isinstance(source, Iterable):
+            raise MapError(f"maps: expected a solution or maps, got {brief(source)}; read a file with Listing.load")
+        maps = tuple(source)
+        for i, ssh_map in enumerate(maps):
+            if not isinstance(ssh_map, SSHMap):
+                raise MapError(f"maps[{i}]: expected a map, got {brief(ssh_map)}; give the maps of a solution")
+        return cls(maps).checked()
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Listing:
+        """What `solve --json` printed into a file, or the one map that `SSHMap.save` wrote; - for standard input. Raises MapError."""
+        return cls.from_dict(read_json(path), "standard input" if str(path) == "-" else named(path))
+
+    @classmethod
+    def from_dict(cls, data: Any, where: str = "maps") -> Listing:
+        """What `solve --json` printed (docs/formats.md). Raises MapError with the field that is wrong."""
+        maps = tuple(ssh_map.renumbered() for ssh_map in maps_of(data, where))
+        told: Mapping[str, Any] = data if isinstance(data, Mapping) and "maps" in data else {}
+        for i, (record, ssh_map) in enumerate(zip(told.get("maps", [data]), maps, strict=True)):
+            if "id" in record and record["id"] != ssh_map.id:
+                mend = "the map was changed by hand: solve again, or leave the id out"
+                raise MapError(f"{where}: maps[{i}]: id: expected {ssh_map.id}, as such a map has, got {brief(record['id'])}; {mend}")
+        if maps and "steps" in told and told["steps"] != len(maps[0].labels):
+            raise MapError(
+                f"{where}: steps: expected {len(maps[0].labels)}, as map 1 has, got {brief(told['steps'])}; solve the trace again"
+            )
+        theory = Theory.from_dict(told["theory"]) if "theory" in told else None
+        levels = told.get("levels")
+        minimal: Any = len(maps)
+        if levels is not None:
+            first = levels[0] if isinstance(levels, list) and levels else None
+            minimal = first.get("count") if isinstance(first, Mapping) else None
+            if not is_whole(minimal) or not 0 < minimal <= len(maps):
+                raise MapError(
+                    f"{where}: levels: expected a list whose first entry counts the minimal maps, got {brief(levels)}; solve again"
+                )
+        complete = told.get("complete")
+        if complete is not None and not isinstance(complete, bool):
+            raise MapError(f"{where}: complete: expected true or false, got {brief(complete)}; solve again")
+        backbone = None
+        if maps and "backbone" in told:
+            backbone = Backbone.from_dict(told["backbone"], len(maps[0].labels), f"{where}: backbone")
+        is_optimal = told.get("status") == "optimal"
+        listed = complete or (minimal < len(maps)) if is_optimal else complete
+        listing = cls(maps, minimal if is_optimal else None, listed, told.get("stopped"), backbone, where)
+        return listing.checked(one_view=theory is None or _has_one_view(theory))
+
+    def checked(self, *, one_view: bool = True) -> Listing:
+        """The same, if the maps can be those of one trace. Raises MapError.
+
+        one_view  whether dstates have one view each, so that maps tell what was seen at each step
+        """
+        if not self.maps:
+            raise MapError(f"{self.source}: expected maps to compare, got none; see the status that solve gave")
+        first = None
+        for i, ssh_map in enumerate(self.maps):
+            if len(ssh_map.labels) != self.steps:
+                mend = "compare maps of one trace"
+                raise MapError(f"{self._name(i)}: expected {self.steps} steps, as {self._name(0)} has, got {len(ssh_map.labels)}; {mend}")
+            if not one_view:
+                continue
+            seen = _seen(ssh_map)
+            first = first or seen
+            if first != seen:
+                self._raise_other_trace(first, seen, i)
+        return self
+
+    def check_same_trace(self, other: Listing) -> None:
+        """Raises MapError where the maps of another listing are of another trace."""
+        if other.steps != self.steps:
+            mend = "compare maps of one trace"
+            raise MapError(f"{other.source}: expected {self.steps} steps, as the maps of {self.source} have, got {other.steps}; {mend}")
+        for t, (here, there) in enumerate(zip(_seen(self.maps[0]), _seen(other.maps[0]), strict=True)):
+            if here != there:
+                raise MapError(
+                    f"{other.source}: expected the view {brief(here)} at step {t}, as the maps of {self.source} have, "
+                    f"got {brief(there)}; compare maps of one trace"
+                )
+
+    def number(self, name: str) -> int:
+        """Which map is meant, from 0: by its number, counted from 1, or by its id. Raises MapError."""
+        text = str(name)
+        if len(text) < ID_LENGTH and text.isdecimal() and text.isascii() and 1 <= int(text) <= len(self.maps):
+            return int(text) - 1
+        found = [i for i, ssh_map in enumerate(self.maps) if ssh_map.id == text]
+        if not found:
+            raise MapError(
+                f"{self.source}: expected the number of a map, 1 to {len(self.maps)}, or its id, got {brief(text)}; see the file"
+            )
+        return found[0]
+
+    def _name(self, i: int) -> str:
+        return f"maps[{i}]" if self.source == "maps" else f"{self.source}: maps[{i}]"
+
+    def _raise_other_trace(self, first: tuple[View, ...], seen: tuple[View, ...], i: int) -> None:
+        step = next(t for t, (a, b) in enumerate(zip(first, seen, strict=True)) if a != b)
+        raise MapError(
+            f"{self._name(i)}: expected the view {brief(first[step])} at step {step}, as {self._name(0)} has, got {brief(seen[step])}; "
+            "compare maps of one trace"
+        )
+
+
+Maps: TypeAlias = Solution | Listing | SSHMap | Iterable[SSHMap]
+
+
+def _has_one_view(theory: Theory) -> bool:
+    return "functional_view" not in theory.without
+
+
+def _seen(ssh_map: SSHMap) -> tuple[View, ...]:
+    """What was seen at each step, as far as a map of dstates with one view each tells."""
+    views = [s.view for s in ssh_map.dstates]
+    seen = [views[label] for label in ssh_map.labels]
+    for fault in ssh_map.faults:
+        if fault.kind == "misread" and fault.seen is not None:
+            seen[fault.step] = fault.seen
+    return tuple(seen)

@@ -1,0 +1,139 @@
+"""Maps of one trace as arrays, so that thousands of them are compared in seconds.
+
+Steps that are one dstate in all maps are a *class*, and stand in the first step of it. Of each sort (dstates, places, paths, courses) the table has
+for each map and class the first class that is one with it: so the numbers that maps give to their dstates, places and paths play no part.
+
+>>> from ssh_abduction.maps import DState, SSHMap
+>>> a, b = DState(0, "hall"), DState(1, "hall")
+>>> table = Table([SSHMap((0, 0, 1), (a, b), ()), SSHMap((0, 1, 1), (a, b), ())])
+>>> table.ones["dstates"].tolist()
+[[0, 0, 2], [0, 1, 1]]
+>>> [(first, later, column.tolist()) for first, later, column in table.questions("dstates")]
+[(0, 1, [True, False]), (1, 2, [False, True])]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.engines.doubts import Sort
+from ssh_abduction.maps import DState, SSHMap
+from ssh_abduction.solver.sharing import SORTS, Backbone, Shared
+
+Ints: TypeAlias = NDArray[np.int32]
+Bools: TypeAlias = NDArray[np.bool_]
+NONE = -1  # what stands for no place, path or course
+
+
+class Table:
+    """Maps of one trace as arrays.
+
+    firsts   the first step of each class
+    classes  the class of each step
+    ones     for each sort that all maps have: for each map and class the first class that is one with it, NONE where there is no place, path or course
+    """
+
+    def __init__(self, maps: Sequence[SSHMap]) -> None:
+        labelings = {ssh_map.labels: i for i, ssh_map in enumerate(maps)}
+        by_labels = {labels: np.array(labels, dtype=np.int32) for labels in labelings}
+        self.classes = _common_classes(list(by_labels.values()))
+        _, self.firsts = np.unique(self.classes, return_index=True)
+        label_of = {labels: numbers[self.firsts].tolist() for labels, numbers in by_labels.items()}
+        has_places = all(any(s.place is not None for s in ssh_map.dstates) for ssh_map in maps)
+        self.ones: dict[Sort, Ints] = {}
+        for sort in SORTS if has_places else SORTS[:1]:
+            known: dict[tuple[Hashable, ...], Ints] = {}
+            rows = []
+            for ssh_map in maps:
+                of_dstate = [_name(s, sort) for s in ssh_map.dstates]
+                names = tuple(of_dstate[label] for label in label_of[ssh_map.labels])
+                if names not in known:
+                    known[names] = _firsts_of(names)
+                rows.append(known[names])
+            self.ones[sort] = np.array(rows, dtype=np.int32)
+
+    def __len__(self) -> int:
+        """How many maps there are."""
+        return len(self.ones["dstates"])
+
+    def steps_of(self, classes: Sequence[int]) -> tuple[int, ...]:
+        """The steps of some classes."""
+        return tuple(np.flatnonzero(np.isin(self.classes, classes)).tolist())
+
+    def variants(self, sort: Sort) -> int:
+        """How many different ones of a sort there are: how many labelings, for example."""
+        return len(np.unique(self.ones[sort], axis=0))
+
+    def heads(self, sort: Sort) -> Ints:
+        """For each class the first class that goes with it in every map: they are one in all maps, or have no place, path or course in the same ones."""
+        _, first, inverse = np.unique(self.ones[sort], axis=1, return_index=True, return_inverse=True)
+        return first[inverse.reshape(-1)].astype(np.int32)
+
+    def questions(self, sort: Sort) -> Iterator[tuple[int, int, Bools]]:
+        """Questions that tell maps apart: two classes, the earlier one first, and for each map whether they are one in it. Of a class with itself: whether it is
+        along a path (at a place) at all.
+
+        Only such pairs are asked about in which the earlier class is the first one of its kind in some map. That is enough: where two maps differ in what a
+        class is one with, they differ in the first such class.
+        """
+        ones = self.ones[sort]
+        for c in np.flatnonzero((ones != ones[0]).any(axis=0)).tolist():
+            for h in np.unique(ones[:, c]).tolist():
+                if h == NONE:
+                    yield c, c, ones[:, c] != NONE
+                elif h != c and not (same := ones[:, h] == ones[:, c]).all():
+                    yield h, c, same
+
+    def shared(self) -> Backbone:
+        """What these maps share."""
+        found = {sort: self._shared(ones) for sort, ones in self.ones.items()}
+        return Backbone(found["dstates"], found.get("places"), found.get("paths"), found.get("courses"), proven=False)
+
+    def _shared(self, ones: Ints) -> Shared:
+        _, column = np.unique(ones, axis=1, return_inverse=True)
+        number: dict[Hashable, int] = {}
+        named = (ones != NONE).all(axis=0).tolist()
+        of_class = [
+            number.setdefault(("one", k) if named[c] else ("own", c), len(number)) for c, k in enumerate(column.reshape(-1).tolist())
+        ]
+        heads = [of_class.index(n) for n in range(len(number))]
+        columns = ones[:, heads]
+        pairs = []
+        for n in range(len(heads)):
+            is_named = columns[:, n] != NONE
+            if is_named.any() and not is_named.all():
+                pairs.append((n, n))
+            one_in_some = ((columns[:, n + 1 :] == columns[:, [n]]) & is_named[:, None]).any(axis=0)
+            pairs += [(n, n + 1 + d) for d in np.flatnonzero(one_in_some).tolist()]
+        first = [int(self.firsts[head]) for head in heads]
+        always = tuple(of_class[c] for c in self.classes.tolist())
+        return Shared(always, tuple(sorted((first[n], first[d]) for n, d in pairs)))
+
+
+def _common_classes(labelings: Sequence[Ints]) -> Ints:
+    """Classes of steps that have one label in each labeling, numbered by first visit."""
+    classes = labelings[0].astype(np.int64)
+    for labels in labelings[1:]:
+        _, classes = np.unique(classes * (int(labels.max()) + 1) + labels, return_inverse=True)
+    _, first, inverse = np.unique(classes, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), dtype=np.int32)
+    rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
+    return rank[inverse.reshape(-1)]
+
+
+def _firsts_of(names: Sequence[Hashable]) -> Ints:
+    """For each name where it comes first; NONE for no name."""
+    first: dict[Hashable, int] = {}
+    return np.array([NONE if name is None else first.setdefault(name, i) for i, name in enumerate(names)], dtype=np.int32)
+
+
+def _name(dstate: DState, sort: Sort) -> Hashable:
+    if sort == "dstates":
+        return dstate.id
+    if sort == "places":
+        return dstate.place
+    return dstate.path if sort == "paths" or dstate.path is None else (dstate.path, dstate.direction)

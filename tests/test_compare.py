@@ -1,0 +1,524 @@
+"""Rival maps compared: against explicit lists, brute force over divisions of questions, and files that are not what they should be."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import random
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+from itertools import combinations, product
+from math import prod
+from pathlib import Path as FilePath
+
+import clingo
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import theories, traces
+from worlds import rectangle, written
+
+from benchmarks.instances import maze
+from ssh_abduction import Comparison, Listing, MapError, SSHMap, Theory, Trace, compare, difference, solve
+from ssh_abduction.cli import main
+from ssh_abduction.cli import solve as solving
+from ssh_abduction.cli.text import compared
+from ssh_abduction.engines import framed, naming
+from ssh_abduction.maps import DState, Fault, Fit, Path
+from ssh_abduction.rivals.compare import Matter, Question
+from ssh_abduction.rivals.factors import deciding, independent
+from ssh_abduction.rivals.table import Table
+from ssh_abduction.solver import search as searching
+from ssh_abduction.solver.sharing import Backbone, Sharing
+
+ACES3 = "examples/aces3-route.jsonl"
+FREE_PLACES = Theory(star="none", prefer=("dstates", "places", "paths"))  # under which the route has 102 maps
+
+
+def divisions(items: Sequence[int]) -> Iterator[list[list[int]]]:
+    """All ways to divide items into sets."""
+    if not items:
+        yield []
+        return
+    for rest in divisions(items[1:]):
+        yield [[items[0]], *rest]
+        for i in range(len(rest)):
+            yield [*rest[:i], [items[0], *rest[i]], *rest[i + 1 :]]
+
+
+relations = st.integers(1, 5).flatmap(
+    lambda n: st.lists(st.lists(st.booleans(), min_size=n, max_size=n), min_size=1, max_size=12, unique_by=tuple)
+)
+
+
+def _product(blocks: Sequence[Sequence[tuple[bool, ...]]], order: Sequence[int]) -> list[list[bool]]:
+    rows = [[x for part in parts for x in part] for parts in product(*blocks)]
+    return [[row[i] for i in order] for row in rows]
+
+
+products = st.lists(
+    st.integers(1, 2).flatmap(lambda n: st.lists(st.tuples(*[st.booleans()] * n), min_size=1, max_size=3, unique=True)),
+    min_size=1,
+    max_size=3,
+).flatmap(lambda blocks: st.permutations(range(sum(len(block[0]) for block in blocks))).map(lambda order: _product(blocks, order)))
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(relations | products)
+def test_choices_are_the_finest_division_that_brute_force_finds(rows: list[list[bool]]) -> None:
+    table = np.array(rows, dtype=bool)
+
+    def is_product(division: list[list[int]]) -> bool:
+        return prod(len({tuple(row[i] for i in part) for row in rows}) for part in division) == len(rows)
+
+    finest = max((division for division in divisions(range(len(rows[0]))) if is_product(division)), key=len)
+    assert {frozenset(part) for part in independent(table.T)} == {frozenset(part) for part in finest}
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(relations)
+def test_deciding_questions_tell_all_apart_and_none_is_superfluous(rows: list[list[bool]]) -> None:
+    table = np.array(rows, dtype=bool)
+    chosen = deciding(table.T, len(rows))
+
+    def apart(questions: Sequence[int]) -> int:
+        return len({tuple(row[i] for i in questions) for row in rows})
+
+    assert apart(chosen) == len(rows)
+    assert all(apart([j for j in chosen if j != i]) < len(rows) for i in chosen)
+    if chosen:  # the first one splits most pairs, or was made superfluous by others that split as many
+        most = max(sum(a[i] != b[i] for a, b in combinations(rows, 2)) for i in range(len(rows[0])))
+        first = chosen[0]
+        assert sum(a[first] != b[first] for a, b in combinations(rows, 2)) == most or len(chosen) > 1
+
+
+def is_one(ssh_map: SSHMap, sort: Matter, i: int, j: int) -> bool:
+    """Whether two steps are one, as the map says without a look at arrays."""
+    here, there = (ssh_map.dstates[ssh_map.labels[t]] for t in (i, j))
+    if sort == "dstates":
+        return here.id == there.id
+    if sort == "places":
+        return here.place is not None and here.place == there.place
+    if sort == "paths":
+        return here.path is not None and here.path == there.path
+    return here.path is not None and (here.path, here.direction) == (there.path, there.direction)
+
+
+def answer(ssh_map: SSHMap, question: Question) -> bool:
+    return question.fault in ssh_map.faults if question.fault else is_one(ssh_map, question.sort, question.first, question.later)
+
+
+def holds_of(found: Comparison, maps: Sequence[SSHMap]) -> None:
+    """All that a comparison says is so in the explicit list."""
+    sharing = Sharing()
+    for ssh_map in maps:
+        sharing.absorb(ssh_map)
+    assert found.listed == sharing.backbone(proven=found.listed.proven)
+    assert len({tuple(answer(m, q) for q in found.deciding) for m in maps}) == len(maps)
+    asked = [question for choice in found.choices for question in choice.questions]
+    assert sorted(map(str, asked)) == sorted(map(str, found.deciding))
+    assert prod(len(choice.options) for choice in found.choices) == len(maps)
+    assert len(set(product(*(range(len(choice.options)) for choice in found.choices)))) == len(maps)
+    for choice in found.choices:
+        assert sorted(i for option in choice.options for i in option.maps) == list(range(1, len(maps) + 1))
+        for option in choice.options:
+            assert len(option.maps) * len(choice.options) == len(maps)
+            assert {tuple(answer(maps[i - 1], q) for q in choice.questions) for i in option.maps} == {option.answers}
+    for question in found.deciding:
+        assert question.yes == sum(answer(m, question) for m in maps)
+        assert 0 < question.yes < len(maps)
+        if not question.fault:
+            assert {
+                answer(m, replace(question, first=i, later=question.later)) for m in maps for i in question.here if i != question.later
+            } <= {True, False}
+            for side, step in ((question.here, question.first), (question.there, question.later)):
+                assert all(is_one(m, question.sort, step, t) for m in maps for t in side if is_one(m, question.sort, step, step))
+    assert sorts_differing(found) == naive_differing(maps)
+
+
+def sorts_differing(found: Comparison) -> dict[str, set[int]]:
+    told: dict[str, set[int]] = {}
+    for differing in (*(choice.differing for choice in found.choices), found.together):
+        for sort, steps in differing.items():
+            if sort != "faults":
+                told.setdefault(sort, set()).update(steps)
+    return told
+
+
+def naive_differing(maps: Sequence[SSHMap]) -> dict[str, set[int]]:
+    """The steps of which the first step that they are one with is not the same in all maps."""
+    steps = range(len(maps[0].labels))
+    sorts: tuple[Matter, ...] = ("dstates", "places", "paths", "courses")
+    found = {sort: {t for t in steps if len({next((i for i in steps if is_one(m, sort, i, t)), None) for m in maps}) > 1} for sort in sorts}
+    return {sort: differing for sort, differing in found.items() if differing}
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.data())
+def test_what_is_said_of_maps_is_so_in_the_explicit_list(data: st.DataObject) -> None:
+    trace = data.draw(traces(max_steps=6), label="trace")
+    maps = solve(trace, data.draw(theories(trace), label="theory"), maps=60, limit=10).maps
+    if not maps:
+        return
+    if len(maps) > 1 and data.draw(st.booleans(), label="few"):  # any maps of one trace are compared, not only all minimal ones
+        maps = tuple(data.draw(st.lists(st.sampled_from(maps), min_size=1, max_size=7, unique=True), label="maps"))
+    holds_of(compare(maps), maps)
+    for one, other in list(combinations(maps, 2))[:5]:
+        regroups(one, other)
+
+
+def regroups(one: SSHMap, other: SSHMap) -> None:
+    """The difference of two maps, applied to the first one, makes the other one."""
+    found = difference(one, other)
+    assert (str(found) == "the maps are the same") == found.same == (one == other)
+    moved_courses = {t for change in found.changes if change.sort == "paths" for group in (*change.first, *change.other) for t in group}
+    for sort in ("dstates", "places", "paths", "courses"):
+        groups = [naive_groups(ssh_map, sort) for ssh_map in (one, other)]
+        changes = [change for change in found.changes if change.sort == sort]
+        for change in changes:
+            assert set(change.first) <= groups[0]
+            assert set(change.other) <= groups[1]
+            assert set(change.first) != set(change.other)
+        kept = [g - {x for c in changes for x in side(c)} for g, side in zip(groups, (lambda c: c.first, lambda c: c.other), strict=True)]
+        if sort == "courses":
+            kept = [{g for g in some if moved_courses.isdisjoint(g)} for some in kept]
+        assert kept[0] == kept[1]
+
+
+def naive_groups(ssh_map: SSHMap, sort: Matter) -> set[tuple[int, ...]]:
+    steps = range(len(ssh_map.labels))
+    return {group for t in steps if (group := tuple(i for i in steps if is_one(ssh_map, sort, i, t)))}
+
+
+def test_maps_that_differ_in_places_alone() -> None:
+    solution = solve(Trace.load(ACES3), FREE_PLACES, maps=0)
+    found = compare(solution)
+    assert found.sentence == solution.summary == "102 minimal maps: the same dstates and paths; the places of steps 14–22 differ"
+    assert found.variants == {"dstates": 1, "places": 102, "paths": 1, "courses": 1}
+    assert {question.sort for question in found.deciding} == {"places"}
+    holds_of(found, solution.maps)
+
+
+def test_maps_that_differ_in_paths_alone_say_which_stretches_are_one_path() -> None:
+    solution = solve(maze(5, 5, steps=100, seed=1, stars=True).trace, maps=0)
+    maps = [m for m in solution.maps if m.labels == solution.maps[0].labels]
+    found = compare(maps)
+    assert len(maps) == 4
+    assert found.sentence.startswith("4 maps: the same dstates and places; the paths of steps ")
+    assert {question.sort for question in found.deciding} == {"paths", "courses"}
+    assert all(question.places for question in found.deciding)
+    holds_of(found, maps)
+
+
+def test_independent_choices_are_factors() -> None:
+    solution = solve(Trace.load(ACES3), Theory(prefer=("dstates",)), maps=0)
+    found = compare(solution)
+    assert found.product == "68 = 2 x 34"
+    holds_of(found, solution.maps)
+    assert "  68 = 2 x 34: these choices are independent of each other" in list(compared(found))
+
+
+def of_streets(rng: random.Random, count: int, dstates: int, steps: int) -> list[SSHMap]:
+    """Maps of many dstates that differ in places, paths and labels at random."""
+    maps = []
+    for _ in range(count):
+        labels = tuple(range(dstates)) + tuple(
+            rng.randrange(dstates - 3, dstates) if t % 50 == 0 else t % dstates for t in range(steps - dstates)
+        )
+        states = tuple(
+            DState(i, "v", i // 4 if rng.random() < 0.99 else 0, i // 10 if rng.random() < 0.99 else 1, rng.choice([1, 1, 1, -1]))
+            for i in range(dstates)
+        )
+        places = tuple(sorted({s.place for s in states if s.place is not None}))
+        paths = tuple(Path(h, ()) for h in sorted({s.path for s in states if s.path is not None}))
+        maps.append(SSHMap(labels, states, (), places, paths).renumbered())
+    return maps
+
+
+def test_maps_of_all_kinds_are_compared_whatever_they_are_of() -> None:
+    """Arrays say what the absorbing of one map after the other says, also where dstates, places and paths differ in every map."""
+    maps = of_streets(random.Random(1), 12, 40, 120)
+    sharing = Sharing()
+    for ssh_map in maps:
+        sharing.absorb(ssh_map)
+    assert Table(maps).shared() == sharing.backbone(proven=False)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ids_do_not_depend_on_how_things_are_numbered(seed: int) -> None:
+    rng = random.Random(seed)
+    maps = solve(Trace.load(ACES3), maps=0).maps
+    assert len({m.id for m in maps}) == len(maps)
+    for ssh_map in maps:
+        number, place, path = (rng.sample(range(n), n) for n in (len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths)))
+        way = [rng.choice([1, -1]) for _ in path]
+        states = [
+            replace(s, id=number[s.id], place=place[s.place or 0], path=path[s.path or 0], direction=(s.direction or 0) * way[s.path or 0])
+            if s.path is not None
+            else replace(s, id=number[s.id], place=place[s.place or 0])
+            for s in ssh_map.dstates
+        ]
+        other = replace(
+            ssh_map,
+            labels=tuple(number[label] for label in ssh_map.labels),
+            dstates=tuple(sorted(states, key=lambda s: s.id)),
+            links=tuple((number[s], action, number[x]) for s, action, x in ssh_map.links),
+            paths=tuple(Path(path[p.id], tuple(place[q] for q in p.order[:: way[p.id]])) for p in ssh_map.paths),
+        )
+        assert other.id == ssh_map.id
+        assert compare([ssh_map], [other]).others is not None
+        assert difference(ssh_map, other).same
+    assert replace(maps[0], faults=(Fault(3, "slipped", "travel"),)).id != maps[0].id
+
+
+LISTS = """
+import sys
+from benchmarks.instances import maze
+from ssh_abduction import Theory, Trace, solve
+for trace, theory in ((Trace.load("examples/aces3-route.jsonl"), None), (maze(5, 5, steps=60, seed=3).trace, Theory.causal())):
+    print([ssh_map.id for ssh_map in solve(trace, theory, maps=0).maps])
+"""
+
+
+def test_ids_and_their_order_are_the_same_in_each_run() -> None:
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", LISTS], env={"PYTHONHASHSEED": seed, "PYTHONPATH": "."}, capture_output=True, text=True, check=True
+        ).stdout
+        for seed in ("0", "4242")
+    ]
+    assert runs[0] == runs[1]
+    assert runs[0].count("[") == 2
+
+
+def test_the_order_of_a_complete_list_is_the_same_with_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[int] = []
+    lists = []
+    for threads in (1, 4):
+
+        def give(control: clingo.Control, *, two: bool, threads: int = threads) -> None:
+            given.append(threads)
+            control.configuration.solve.parallel_mode = f"{threads},compete"  # type: ignore[union-attr]
+
+        for module in (framed, naming):
+            monkeypatch.setattr(module, "give_threads", give)
+        solution = solve(maze(5, 5, steps=100, seed=1, stars=True).trace, maps=0)
+        assert solution.complete
+        lists.append([m.id for m in solution.maps])
+    assert len(lists[0]) == 7
+    assert lists[0] == lists[1]
+    assert set(given) == {1, 4}
+
+
+def test_a_list_is_in_order_whatever_order_maps_are_found_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = solve(Trace.load(ACES3), FREE_PLACES, maps=0)
+    found = searching.Search._found
+
+    def shuffled(search: searching.Search) -> Iterator[SSHMap]:
+        maps = list(found(search))
+        random.Random(7).shuffle(maps)
+        return iter(maps)
+
+    monkeypatch.setattr(searching.Search, "_found", shuffled)
+    again = solve(Trace.load(ACES3), FREE_PLACES, maps=0)
+    assert [m.id for m in again.maps] == [m.id for m in usual.maps]
+    assert again.cost == usual.cost
+
+
+def test_the_map_that_closes_best_stays_first() -> None:
+    trace = maze(3, 3, steps=40, seed=4242, stars=True, follow=True, odometry=None).trace
+    maps = solve(trace, maps=0).maps
+    fitted = [replace(m, fit=Fit(float(len(maps) - i), 3, 0.5)) for i, m in enumerate(maps)]
+    from ssh_abduction.solver.ranking import in_order
+
+    ordered = in_order(fitted, [len(fitted)])
+    assert [m.fit and m.fit.chi2 for m in ordered] == sorted(m.fit.chi2 for m in fitted if m.fit)
+    assert in_order(ordered[::-1], [len(fitted)]) == ordered
+
+
+@cache
+def printed_by(*words: str) -> str:
+    """What `solve --json` prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert main(["solve", *words, "--json"]) == 0
+    return out.getvalue()
+
+
+@pytest.fixture
+def file_of(tmp_path: FilePath) -> Callable[..., FilePath]:
+    """A file of what `solve --json` prints."""
+
+    def written_by(*words: str, name: str = "maps.json") -> FilePath:
+        path = tmp_path / name
+        path.write_text(printed_by(*words))
+        return path
+
+    return written_by
+
+
+def test_the_shell_prints_what_python_says(file_of: Callable[..., FilePath], capsys: pytest.CaptureFixture[str]) -> None:
+    path = file_of(ACES3, "-n", "0")
+    solution = solve(Trace.load(ACES3), maps=0)
+    found = compare(solution)
+    assert main(["compare", str(path)]) == 0
+    assert capsys.readouterr().out.startswith(f"{solution.summary}\n  4 = 2 x 2: ")
+    assert main(["compare", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(found.to_dict()))
+    told = difference(solution.maps[0], solution.maps[2], ("map 1", "map 3"))
+    for names in (("1", "3"), (found.ids[0], found.ids[2])):
+        assert main(["compare", str(path), "--diff", *names]) == 0
+        assert capsys.readouterr().out == f"{told}\n"
+    assert main(["compare", str(path), "--diff", "1", "3", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["words"] == list(told.lines)
+    assert main(["compare", str(path), "--diff", "2", "2"]) == 0
+    assert capsys.readouterr().out == "the maps are the same\n"
+
+
+def test_where_not_all_are_listed_the_backbone_says_what_all_share(
+    file_of: Callable[..., FilePath], capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut, every = file_of(ACES3, "-n", "2", name="cut.json"), file_of(ACES3, "-n", "0")
+    assert main(["compare", str(cut), str(every)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith(
+        "at least 2 minimal maps (listing was stopped by the maps limit): the same dstates; the places of steps 15–18 and 21 differ; "
+    )
+    assert "of the 2 maps listed: " in printed
+    assert "only in maps that are not listed: the " in printed
+    assert "2 in both, 0 only in the first and 2 only in " in printed
+    found = compare(Listing.load(cut))
+    assert found.shared.proven
+    assert not found.listed.proven
+    assert found.shared == replace(compare(Listing.load(every)).shared, proven=True)
+    assert found.unlisted
+    python = compare(solve(Trace.load(ACES3), maps=2))
+    assert python.shared == found.shared
+
+
+def test_a_search_that_was_stopped_says_as_far_as_was_found_out() -> None:
+    maps = solve(Trace.load(ACES3), maps=0).maps
+    listing = Listing(maps[:2], minimal=2, complete=False, stopped="time limit")
+    assert compare(listing).sentence.endswith("as far as was found out: others may differ in more")
+    assert compare(maps[:1]).sentence == "1 map"
+
+
+def test_causal_maps_and_maps_with_faults() -> None:
+    causal = solve(maze(5, 5, steps=60, seed=3).trace, Theory.causal(), maps=0)
+    found = compare(causal)
+    assert set(found.variants) == {"dstates"}
+    holds_of(found, causal.maps)
+    seen = [f"v{t % 4}" if t != 9 else "v0" for t in range(14)]
+    faulty = solve(Trace.from_steps(seen, (["right", "travel"] * 7)[:13]), Theory.causal().replace(misread=0.5, slipped=0.5), maps=0)
+    assert len({m.faults for m in faulty.maps}) > 1
+    told = compare(faulty)
+    holds_of(told, faulty.maps)
+    assert told.deciding[0].sort == "faults"
+    assert str(told.deciding[0]).startswith(("the view at step ", "the action at step "))
+    one, other = next((m, n) for m, n in combinations(faulty.maps, 2) if m.faults != n.faults)
+    assert any(line.startswith("faults: only in the first map the ") for line in difference(one, other).lines)
+
+
+def test_larger_maps_are_told_from_minimal_ones(file_of: Callable[..., FilePath], capsys: pytest.CaptureFixture[str]) -> None:
+    path = file_of(ACES3, "-n", "0", "--within", "3")
+    assert main(["compare", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("4 minimal maps, and 7 larger ones: ")
+    assert "  4 maps with 19 dstates, " in printed
+
+
+def edited(path: FilePath, change: Callable[[dict[str, object]], object]) -> FilePath:
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d["maps"][1]["labels"].__setitem__(4, 0), "maps[1]: id: expected "),
+        (lambda d: d["maps"][1].update(id="no"), "maps[1]: id: expected "),
+        (lambda d: d.update(maps=[]), "expected maps to compare, got none"),
+        (lambda d: d.update(maps=5), "maps: expected a list, got 5"),
+        (lambda d: d.update(steps=7), "steps: expected 23, as map 1 has, got 7"),
+        (lambda d: d.update(complete="yes"), "complete: expected true or false, got 'yes'"),
+        (lambda d: d.update(backbone=[]), "backbone: expected an object with proven and dstates, got []"),
+        (lambda d: d["backbone"]["dstates"]["always"].pop(), "backbone: dstates.always: expected 23 numbers"),
+        (lambda d: d["backbone"]["places"].update(sometimes=[[0, 99]]), "backbone: places.sometimes: expected pairs of steps, 0 to 22"),
+        (lambda d: (d.update(complete=False), d["backbone"]["places"].update(sometimes=[])), "backbone: places: steps "),
+        (lambda d: (d["maps"][0]["dstates"][0].update(view="x"), d["maps"][0].pop("id")), "expected the view 'x' at step 0, as "),
+        (lambda d: d["theory"].update(level="no"), "level"),
+        (lambda d: d.update(levels=[]), "levels: expected a list"),
+    ],
+)
+def test_files_that_are_not_what_they_should_be(
+    file_of: Callable[..., FilePath], capsys: pytest.CaptureFixture[str], change: Callable[[dict[str, object]], object], message: str
+) -> None:
+    assert main(["compare", str(edited(file_of(ACES3, "-n", "0"), change))]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_maps_of_other_traces_are_refused(file_of: Callable[..., FilePath], capsys: pytest.CaptureFixture[str], tmp_path: FilePath) -> None:
+    path = file_of(ACES3, "-n", "0")
+    rectangle(22).save(tmp_path / "other.jsonl")
+    rectangle(9).save(tmp_path / "short.jsonl")
+    other, short = file_of(str(tmp_path / "other.jsonl"), name="other.json"), file_of(str(tmp_path / "short.jsonl"), name="short.json")
+    for words, message in (
+        ((str(path), str(other)), "expected the view 'open-ahead-right-back' at step 0, as the maps of "),
+        ((str(path), str(short)), "expected 23 steps, as the maps of "),
+        ((str(path), "--diff", "1", "9"), "expected the number of a map, 1 to 4, or its id, got '9'"),
+        ((str(path), "--diff", "0", "1"), "expected the number of a map, 1 to 4, or its id, got '0'"),
+        ((str(path), "--diff", "abcdef012345", "1"), "or its id, got 'abcdef012345'"),
+    ):
+        assert main(["compare", *words]) == 1
+        assert message in capsys.readouterr().err
+    maps, others = solve(Trace.load(ACES3)).maps, solve(rectangle(9)).maps
+    for wrong, said in (
+        ([maps[0], others[0]], "maps[1]: expected 23 steps, as maps[0] has, got 10"),
+        ([maps[0], 5], "maps[1]: expected a map, got 5"),
+        ("maps.json", "maps: expected a solution or maps, got 'maps.json'; read a file with Listing.load"),
+        (7, "maps: expected a solution or maps, got 7"),
+        ([], "maps: expected maps to compare, got none"),
+    ):
+        with pytest.raises(MapError) as error:
+            compare(wrong)  # type: ignore[arg-type]
+        assert str(error.value).startswith(said)
+    with pytest.raises(MapError, match="expected two of one trace, got one of 23 steps and one of 10"):
+        difference(maps[0], others[0])
+
+
+def test_the_backbone_survives_files_also_where_pairs_are_left_out() -> None:
+    maps = of_streets(random.Random(3), 6, 60, 90)
+    sharing = Sharing()
+    for ssh_map in maps:
+        sharing.absorb(ssh_map)
+    backbone = sharing.backbone(proven=True)
+    again = Backbone.from_dict(json.loads(json.dumps(backbone.to_dict())), 90)
+    assert again.sentence == backbone.sentence
+    for sort, shared in backbone.sorts.items():
+        assert again.sorts[sort].differing == shared.differing
+        assert again.sorts[sort].always == shared.always
+
+
+def test_json_streams_what_is_too_much_to_hold(monkeypatch: pytest.MonkeyPatch, file_of: Callable[..., FilePath]) -> None:
+    held = json.loads(file_of(ACES3, "-n", "0").read_text())
+    printed_by.cache_clear()
+    monkeypatch.setattr(solving, "HELD", 2)
+    streamed = json.loads(file_of(ACES3, "-n", "0").read_text())
+    assert [m["id"] for m in held["maps"]] == [m.id for m in solve(Trace.load(ACES3), maps=0).maps]
+    assert {m["id"] for m in streamed["maps"]} == {m["id"] for m in held["maps"]}
+    assert streamed["count"] == held["count"] == len(streamed["maps"])
+    printed_by.cache_clear()
+
+
+def test_one_map_has_nothing_to_be_told_apart_from() -> None:
+    found = compare(solve(written("a T b")))
+    assert (found.sentence, found.choices, found.deciding, found.product) == ("1 minimal map", (), (), "")
+    assert list(compared(found)) == []
