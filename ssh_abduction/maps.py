@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
+from ssh_abduction import cards
 from ssh_abduction.errors import MapError, brief, is_finite, is_writable, named, printable
 from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
 from ssh_abduction.trace import Trace, View
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 SOLUTION_FORMAT, MAP_FORMAT, VERSION = "ssh-solution", "ssh-map", 1
 # Bytes that a file of maps may have: some hundred thousand maps. To read it takes ten times as much memory.
 LARGEST = 2**30
+# Notebooks draw maps of so many dstates at most: to lay out more takes seconds, and nobody could read them there.
+DRAWN = 150
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +169,26 @@ class SSHMap:
         dstates = [(s.view, s.place, s.path, s.direction) for s in whole.dstates]
         faults = [(fault.step, fault.kind, fault.seen, fault.expected) for fault in whole.faults]
         return [whole.labels, dstates, whole.links, whole.places, faults]
+
+    def _repr_html_(self) -> str:
+        """What notebooks show: the picture, how well the map closes, what it disbelieves, and its dstates."""
+        from ssh_abduction.picture import svg
+
+        parts = [
+            cards.picture(svg(self)) if len(self.dstates) <= DRAWN else cards.paragraph(f"not drawn, as it has more than {DRAWN} dstates")
+        ]
+        if self.faults:
+            parts.append(cards.paragraph("; ".join(map(str, self.faults))))
+        if self.fit:
+            parts.append(cards.paragraph(f"chi-square {self.fit.chi2:.1f} for {self.fit.dof} degrees of freedom (p = {self.fit.p:.2g})"))
+        leads: dict[int, list[str]] = {}
+        for source, action, target in self.links:
+            leads.setdefault(source, []).append(f"{action} → {target}")
+        topological = bool(self.places)
+        head = ("dstate", "view", *(("place", "path") if topological else ()), "links")
+        rows = [(s.id, s.view, *(_where(s) if topological else ()), ", ".join(leads.get(s.id, ()))) for s in self.dstates[: cards.ROWS + 1]]
+        table = cards.table(head, [*rows, *(() for _ in self.dstates[len(rows) :])], "dstates")
+        return cards.card(repr(self)[1:-1], *parts, cards.folded(counted(len(self.dstates), "dstates"), table))
 
     def without_headings(self) -> SSHMap:
         """The same map for a theory in which places have no frames."""
@@ -337,6 +360,12 @@ class SSHMap:
             lines.append(f"  subgraph cluster_{p} {{ label={quoted(f'place {p}')}; {inside} }}")
         lines += [f"  {source} -> {target} [label={quoted(action)}];" for source, action, target in self.links]
         return "\n".join([*lines, "}"])
+
+
+def _where(dstate: DState) -> tuple[object, object]:
+    """The place and the course of a dstate, as a table shows them."""
+    place = "" if dstate.place is None else dstate.place
+    return place, "" if dstate.path is None else f"{dstate.path}{'+' if dstate.direction == 1 else '-'}"
 
 
 def write_map(path: str | os.PathLike[str], text: str, what: str = "map", option: str = "output") -> None:

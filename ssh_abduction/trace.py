@@ -14,12 +14,13 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias, overload
 
+from ssh_abduction import cards
 from ssh_abduction.errors import RangeError, TraceError, brief, checked_index, is_finite, is_whole, is_writable, named
 from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
 from ssh_abduction.odometry import Covariance, Displacement, Odometry, checked_covariance, checked_displacement
@@ -33,6 +34,7 @@ TurnDirection: TypeAlias = Literal["right", "left", "around"]
 FORMAT, VERSION = "ssh-trace", 1
 # Bytes that a line of a file may have. A step with a panorama of 100,000 numbers fits; a file that has no line ends is refused before it fills the memory.
 LONGEST_LINE = 16 * 2**20
+SHOWN = 10  # So many steps of a trace are shown in a notebook.
 _KINDS = ("travel", "turn")
 _TURNS = ("right", "left", "around")
 _STEP_FIELDS = ("view", "image", "action", "star", "displacement", "covariance", "truth", "confidence")
@@ -308,6 +310,22 @@ class Trace:
         parts = [counted(len(self), "steps"), *([counted(len(views), "views")] if views else []), counted(actions, "actions")]
         there = {"images": any(step.image is not None for step in self), "stars": self.has_stars, "displacements": self.has_displacements}
         return f"<Trace{name}: {', '.join(parts)}{''.join(f'; {what}' for what, is_there in there.items() if is_there)}>"
+
+    def _repr_html_(self) -> str:
+        """What notebooks show: the first steps, with what was seen and done at them."""
+        columns: dict[str, Callable[[Step], object]] = {
+            "view": lambda step: "" if step.view is None else step.view,
+            "image": lambda step: (
+                f"{counted(len(step.image), 'numbers')}" if isinstance(step.image, tuple) else "" if step.image is None else step.image
+            ),
+            "star": lambda step: "" if step.star is None else ", ".join(map(str, _star_to_json(step.star))),
+            "displacement": lambda step: "" if step.displacement is None else ", ".join(f"{x:.2f}" for x in step.displacement),
+            "action": lambda step: step.action.name if step.action else "",
+        }
+        shown = {name: cell for name, cell in columns.items() if any(cell(step) != "" for step in self.steps[:SHOWN])}
+        rows = [(t, *(cell(step) for cell in shown.values())) for t, step in enumerate(self.steps[:SHOWN])]
+        left = cards.paragraph(f"and {counted(len(self) - SHOWN, 'more steps')}") if len(self) > SHOWN else ""
+        return cards.card(repr(self)[1:-1], cards.table(("step", *shown), rows), left)
 
     @property
     def views(self) -> tuple[View | None, ...]:

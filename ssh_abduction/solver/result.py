@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from enum import Enum
 from typing import Any, overload
 
+from ssh_abduction import cards
 from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import Stop
 from ssh_abduction.engines.base import Cost, cost_as_counted
@@ -182,6 +183,32 @@ class Solution:
 
     def __repr__(self) -> str:
         return f"<Solution {self.headline}>"
+
+    def _repr_html_(self) -> str:
+        """What notebooks show: how the search ended, what the minimal maps share as far as that is known, and the first map; of an unknown answer what is known."""
+        known = self.rivals.backbone if self.rivals is not None else self.backbone
+        parts = [] if self.status is Status.UNSATISFIABLE else [cards.paragraph(summary_of(self, self.count, known))]
+        parts += [cards.paragraph(f"warning: {warning}") for warning in (() if self.stopped == "interrupted" else self.warnings)]
+        if self.count > 1:
+            parts.append(cards.folded(f"{counted(self.count, 'maps')}, of which the first is shown", self._table_of_maps()))
+        shown = self.maps[0] if self.maps else self.partial
+        if shown is not None:
+            first = "" if self.maps else cards.paragraph(f"the best map of the first {counted(len(shown.labels), 'steps')}:")
+            parts.append(first + shown._repr_html_())
+        return cards.card(
+            self.headline,
+            *parts,
+            cards.paragraph(f"{self.seconds.total:.2f} s, {self.prefix} of {counted(self.steps, 'steps')} given to clingo"),
+        )
+
+    def _table_of_maps(self) -> str:
+        """A row a map: what it costs, and how well it closes."""
+        costs, closes = self.costs, [ssh_map.fit.chi2 if ssh_map.fit else None for ssh_map in self.maps]
+        columns: dict[str, list[object]] = {"map": [*range(1, self.count + 1)]}
+        columns |= {name: [getattr(cost, name) for cost in costs] for name in ("dstates", "places", "paths", "excuses", "faults")}
+        columns |= {"chi-square": ["" if chi2 is None else f"{chi2:.1f}" for chi2 in closes]}
+        shown = {name: column for name, column in columns.items() if any(column)}
+        return cards.table([*shown], zip(*shown.values(), strict=True), "maps")
 
     @property
     def headline(self) -> str:

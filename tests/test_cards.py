@@ -1,0 +1,124 @@
+"""What notebooks show of values: well-formed, escaped, small, and of every kind of answer."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import pytest
+from worlds import rectangle
+
+from ssh_abduction import DState, SSHMap, Theory, Trace, solve
+from ssh_abduction.cards import ROWS
+from ssh_abduction.maps import DRAWN
+from ssh_abduction.solver.search import Search
+
+ACES = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
+SVG = "{http://www.w3.org/2000/svg}"
+SCRIPT = "<script>alert(1)</script>"
+
+
+def shown(value: Any) -> tuple[ET.Element, str]:
+    """The HTML of a value, which is XML, too, and its text."""
+    html = value._repr_html_()
+    tree = ET.fromstring(html)
+    return tree, "".join(tree.itertext())
+
+
+def rows(tree: ET.Element) -> list[list[str]]:
+    return [["".join(cell.itertext()) for cell in row] for row in tree.iter("tr")]
+
+
+def test_a_solution_shows_the_first_map_and_what_all_share() -> None:
+    solution = solve(ACES)
+    tree, text = shown(solution)
+    assert "optimal: 19 dstates, 10 places, 4 paths; 4 minimal maps" in text
+    assert solution.summary in text
+    assert len(list(tree.iter(f"{SVG}svg"))) == 1
+    assert rows(tree)[:3] == [["map", "dstates", "places", "paths"], ["1", "19", "10", "4"], ["2", "19", "10", "4"]]
+    assert len(solution._repr_html_()) < 60_000
+
+
+def test_a_map_shows_its_dstates() -> None:
+    (ssh_map,) = solve(rectangle(20)).maps
+    tree, text = shown(ssh_map)
+    assert text.startswith("SSHMap: 8 dstates, 4 places, 4 paths; 21 steps")
+    assert rows(tree)[0] == ["dstate", "view", "place", "path", "links"]
+    assert rows(tree)[1] == ["0", "v0", "0", "0+", "right → 1"]
+    assert len(rows(tree)) == 9
+
+
+def test_a_trace_shows_its_first_steps() -> None:
+    tree, text = shown(ACES)
+    assert rows(tree)[0] == ["step", "view", "star", "action"]
+    assert rows(tree)[1] == ["0", "open-ahead-right-back", "1, 1, 1, 0", "travel"]
+    assert len(rows(tree)) == 11
+    assert text.endswith("and 13 more steps")
+    metric = Trace.from_steps("ab", ["travel"], displacements=[(1, 0.004, 0)])
+    assert rows(shown(metric)[0]) == [
+        ["step", "view", "displacement", "action"],
+        ["0", "a", "", "travel"],
+        ["1", "b", "1.00, 0.00, 0.00", ""],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("trace", "choices", "said", "drawn"),
+    [
+        (Trace.from_steps("abcd", ["travel", "around", "around"]), {}, "unsatisfiable: no map of 4 steps satisfies the axioms", 0),
+        (Trace.from_steps("abcd", ["travel", "around", "around"]), {"limit": 1e-9}, "unknown (time limit): no map of 4 steps yet", 0),
+        (ACES, {"limit": 1e-9}, "feasible (time limit): 23 dstates", 1),
+        (rectangle(20), {"theory": Theory.causal().replace(misread=1.5)}, "optimal: 4 dstates", 1),
+    ],
+)
+def test_every_kind_of_answer_is_shown(trace: Trace, choices: dict[str, Any], said: str, drawn: int) -> None:
+    solution = solve(trace, **choices)
+    tree, text = shown(solution)
+    assert text.startswith(said)
+    assert len(list(tree.iter(f"{SVG}svg"))) == drawn
+
+
+def test_an_unknown_answer_shows_the_best_map_of_the_first_steps() -> None:
+    search = Search(ACES)
+    search._known.partial = solve(ACES[:10])[0]
+    text = shown(search.solution())[1]
+    assert text.startswith("unknown: no map of 23 steps yet")
+    assert "the best map of the first 10 steps:" in text
+
+
+def test_to_show_a_solution_takes_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    solution = solve(ACES, maps=2)
+    monkeypatch.setattr("ssh_abduction.solver.backbone.prove_backbone", lambda *_: pytest.fail("it searched"))
+    assert "at least 2 minimal maps" in shown(solution)[1]
+
+
+def test_what_is_said_of_faults_and_of_displacements() -> None:
+    seen = [f"v{t % 4}" if t != 9 else "v0" for t in range(25)]
+    trace = Trace.from_steps(seen, ["right", "travel"] * 12)
+    assert "the view at step 9 is misread: v0, expected v1" in shown(solve(trace, Theory.causal().replace(misread=1.5)))[1]
+    square = Trace.from_steps("cwcwcwcwc", ["travel", "left"] * 4, displacements=[(10, 0, 0), (0, 0, 1.5708)] * 4)
+    assert re.search(r"chi-square \d+\.\d for \d+ degrees of freedom", shown(solve(square, Theory.causal())[0])[1])
+
+
+def test_nothing_that_a_trace_says_becomes_html() -> None:
+    trace = Trace.from_steps([SCRIPT, "b", SCRIPT], [{"name": SCRIPT, "kind": "travel"}, "around"], name=f"{SCRIPT}\x1b[2J")
+    solution = solve(trace)
+    for value in (trace, solution, solution[0]):
+        html = value._repr_html_()
+        assert "<script" not in html
+        assert html.isprintable() or "\x1b" not in html
+        tree, text = shown(value)
+        assert SCRIPT in text or value is solution
+        assert not list(tree.iter("script"))
+
+
+def test_a_large_map_is_not_drawn_and_its_table_is_cut() -> None:
+    dstates = tuple(DState(i, f"v{i}") for i in range(DRAWN + 1))
+    large = SSHMap(tuple(range(DRAWN + 1)), dstates, tuple((i, "travel", i + 1) for i in range(DRAWN)))
+    tree, text = shown(large)
+    assert not list(tree.iter(f"{SVG}svg"))
+    assert f"not drawn, as it has more than {DRAWN} dstates" in text
+    assert len(rows(tree)) == ROWS + 1
+    assert f"and {DRAWN + 1 - ROWS} more dstates" in text
