@@ -1,0 +1,76 @@
+"""ssh-abduction explain TRACE [FIRST SECOND]: why are two steps different dstates, or one? Without steps: why has the trace no map?"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from ssh_abduction.asp.limits import Stop
+from ssh_abduction.cli.guard import Guard
+from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.cli.outcome import dump, interrupted_code, on_ctrl_c
+from ssh_abduction.errors import SSHError
+from ssh_abduction.rivals.explain import PairExplanation, PairQuestion, TraceExplanation, TraceQuestion, Verdict
+from ssh_abduction.trace import Trace
+
+EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = (
+        "Explain why two steps of a trace are different dstates in every map, or one, with the axioms that it takes; or else in which maps they are, and what maps of "
+        "the other kind cost. Without steps, explain why the trace has no map, and which one observation, if it were wrong, would mend it."
+    )
+    parser = verbs.add_parser("explain", help="why are two steps one dstate, or not? why is there no map?", description=text)
+    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
+    parser.add_argument(
+        "steps", nargs="*", type=int, default=(), metavar="step", help="two steps, counted from 0; none, to hear why there is no map"
+    )
+    parser.add_argument("-n", "--maps", type=int, default=100, metavar="K", help="count at most K minimal maps; 0 for all (default: 100)")
+    parser.add_argument("--json", action="store_true", help="print the explanation as JSON")
+    parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds with what is known by then")
+    parser.add_argument("--memory-limit", type=int, metavar="MIB", help="stop when the process has used so much memory")
+    add_theory(parser)
+    parser.epilog = "Exit codes: 0 explained; 20 the trace has no map; 30 not found out in time; 1, 2, 130 and 143 as for the other verbs."
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    if len(options.steps) not in (0, 2):
+        raise SSHError(f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are to be explained")
+    trace, theory = Trace.load(options.trace), theory_of(options)
+    limits: dict[str, Any] = {"limit": options.time_limit, "memory": options.memory_limit}
+    question: PairQuestion | TraceQuestion
+    if options.steps:
+        first, second = options.steps
+        question = PairQuestion(trace, first, second, theory, maps=options.maps, **limits)
+    else:
+        question = TraceQuestion(trace, theory, **limits)
+    told = _as_json if options.json else _as_text
+
+    def last_words(why: Stop) -> tuple[str, int]:
+        known = question.known(why)
+        return told(known), _exit_code(known)
+
+    with on_ctrl_c(question.interrupt), Guard(question.interrupt, last_words, options.time_limit, options.memory_limit) as guard:
+        answer = question.answer()
+        guard.say(lambda: told(answer))
+    return _exit_code(answer)
+
+
+def _as_text(explanation: PairExplanation | TraceExplanation) -> str:
+    return f"{explanation}\n"
+
+
+def _as_json(explanation: PairExplanation | TraceExplanation) -> str:
+    return dump(explanation.to_dict()) + "\n"
+
+
+def _exit_code(explanation: PairExplanation | TraceExplanation) -> int:
+    if isinstance(explanation, PairExplanation):
+        no_map, known = explanation.verdict is Verdict.NO_MAP, explanation.proven
+    else:
+        no_map, known = explanation.possible is False, explanation.possible is not None
+    if not known or (no_map and explanation.clash is None):
+        return interrupted_code() if explanation.stopped == "interrupted" else EXIT_UNKNOWN
+    return EXIT_NO_MAP if no_map else 0

@@ -1,0 +1,242 @@
+"""Why two steps are one dstate or not: verdicts against the brute force, derivations against the theories that they name, and mends against the solver."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import pytest
+from brute_force import Key, consistent_maps, key, minimal_maps
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from strategies import TOYS, theories, traces
+
+from ssh_abduction import Status, Theory, Trace, TraceError, solve
+from ssh_abduction.asp import facts
+from ssh_abduction.cli import main
+from ssh_abduction.explain import Axioms, Piece
+from ssh_abduction.rivals.derivation import Derivation
+from ssh_abduction.rivals.explain import PairExplanation, Verdict, explain_pair, explain_trace
+from ssh_abduction.theory.encodings import axioms
+
+RECTANGLE = Trace.load(Path(__file__).parent.parent / "examples" / "notched-rectangle.jsonl")
+IMPOSSIBLE = Trace.from_steps(views="abcd", actions=["travel", "around", "around"])
+
+
+def never() -> bool:
+    return False
+
+
+def only(theory: Theory, names: set[str]) -> Theory:
+    """The theory with these axioms and no others."""
+    rules = {axiom.name for each in theory.rules for axiom in each.axioms}
+    return theory.replace(without=[axiom.name for axiom in axioms() if axiom.name not in names | rules])
+
+
+def possible(derivation: Derivation, trace: Trace, theory: Theory, links: list[tuple[str, int]]) -> bool:
+    """Whether what a derivation rules out is possible where just these axioms hold at just these steps."""
+    piece = Piece.of(trace, theory.resolve(trace), derivation.steps)
+    pair = piece.steps.index(derivation.first), piece.steps.index(derivation.second)
+    active = [facts.active(axiom, piece.steps.index(step)) for axiom, step in links]
+    return Axioms(piece, never, relaxed=True).consistent(active, [(facts.are_one(*pair), not derivation.one)])
+
+
+def check_derivation(derivation: Derivation, trace: Trace, theory: Theory) -> None:
+    """The links suffice, none can be spared, the checker sees each of them broken, and the lines name all of them."""
+    links = [(link.axiom, link.step) for link in derivation.links]
+    assert not possible(derivation, trace, theory, links)
+    first, second = derivation.steps.index(derivation.first), derivation.steps.index(derivation.second)
+    for link in derivation.links:
+        assert possible(derivation, trace, theory, [other for other in links if other != (link.axiom, link.step)])
+        assert (link.without.labels[first] == link.without.labels[second]) != derivation.one
+    told = {(clash.axiom, step) for line in derivation.inferences for clash in line.links for step in clash.steps}
+    assert told == set(links)
+    for number, line in enumerate(derivation.inferences):
+        assert line.says
+        assert all(premise < number for premise in line.premises)
+
+
+@cache
+def argument() -> PairExplanation:
+    """Why steps 0 and 4 of the rectangle are different dstates."""
+    return explain_pair(RECTANGLE, 4, 0)
+
+
+def test_the_argument_of_the_paper() -> None:
+    """x0 is at a place on the path that x1 and x2 define; x4 is at a place to the right of that path; a place on a path is not to its right."""
+    explanation = argument()
+    assert (explanation.first, explanation.second, explanation.verdict) == (0, 4, Verdict.DIFFERENT)
+    derivation = explanation.derivation
+    assert derivation is not None
+    assert derivation.steps == (0, 1, 2, 3, 4)
+    assert derivation.summary == (
+        "step 0 is at a place on the path that steps 1 and 2 define; step 4 would be at a place to the right of that path; "
+        "no place on a path lies right or left of it"
+    )
+    assert {"on_path", "branch_side", "side_of_branch", "path_between_sides"} <= set(derivation.axioms)
+    check_derivation(derivation, RECTANGLE, Theory())
+    assert all(link.violations for link in derivation.links)
+
+
+def test_without_any_one_axiom_the_rectangles_steps_may_be_one() -> None:
+    """By the axioms of the argument alone: the solver finds a map with step 0 = step 4 where one is left out, but none under all of them."""
+    derivation = argument().derivation
+    assert derivation is not None
+    for dropped in (None, *derivation.axioms):
+        theory = only(Theory(same=[(0, 4)]), {*derivation.axioms, "asserted"} - {dropped})
+        solution = solve(RECTANGLE.prefix(5), theory, limit=10, maps=1)
+        assert solution.status is (Status.UNSATISFIABLE if dropped is None else Status.OPTIMAL)
+
+
+@settings(max_examples=45, deadline=None, derandomize=True)
+@given(st.data())
+def test_verdicts_are_those_of_the_brute_force(data: st.DataObject) -> None:
+    trace = data.draw(traces(max_steps=5), label="trace")
+    assume(len(trace) > 1)
+    theory = data.draw(theories(trace), label="theory")
+    first = data.draw(st.integers(0, len(trace) - 2), label="first")
+    second = data.draw(st.integers(first + 1, len(trace) - 1), label="second")
+    compare(trace, theory, first, second)
+
+
+def compare(trace: Trace, theory: Theory, first: int, second: int) -> PairExplanation:
+    """The verdict, the counts and the costs are those of all maps; a derivation holds."""
+    toys = [toy for toy in TOYS if toy.rules in theory.rules]
+
+    def allows(found: Key) -> bool:
+        return all(toy.allows(found) for toy in toys)
+
+    consistent = [labels[first] == labels[second] for (labels, *rest), _ in consistent_maps(trace, theory) if allows((labels, *rest))]  # type: ignore[arg-type]
+    _, minimal = minimal_maps(trace, theory, allows)
+    ones = [labels[first] == labels[second] for labels, *_ in minimal]
+    explanation = explain_pair(trace, first, second, theory, limit=20, maps=0)
+    if not consistent:
+        assert explanation.verdict is Verdict.NO_MAP
+    elif len(set(consistent)) == 1:
+        assert explanation.verdict is (Verdict.SAME if consistent[0] else Verdict.DIFFERENT)
+        assert explanation.derivation is not None
+        check_derivation(explanation.derivation, trace, theory)
+    elif len(set(ones)) == 1:
+        assert explanation.verdict is (Verdict.SAME_IN_MINIMAL if ones[0] else Verdict.DIFFERENT_IN_MINIMAL)
+        lost = explanation.different if ones[0] else explanation.same
+        best, _ = minimal_maps(trace, theory, lambda found: allows(found) and (found[0][first] == found[0][second]) != ones[0])
+        assert best is not None
+        assert lost.cost is not None
+        assert lost.proven
+        assert lost.cost.preferred_by(explanation.theory) == tuple(getattr(best, name) for name in explanation.theory.priorities)
+    else:
+        assert explanation.verdict is Verdict.DISAGREE
+        assert (explanation.same.maps, explanation.different.maps) == (sum(ones), len(ones) - sum(ones))
+        assert explanation.listed
+    return explanation
+
+
+def test_a_long_trace_is_answered_from_few_steps() -> None:
+    near = explain_pair(RECTANGLE, 200, 204)
+    assert near.verdict is Verdict.DIFFERENT
+    assert near.derivation is not None
+    assert near.derivation.steps == (200, 201, 202, 203, 204)
+    far = explain_pair(RECTANGLE, 3, 396)
+    assert far.derivation is not None
+    assert far.derivation.steps == (3, 396)
+    assert far.derivation.axioms == ("functional_view",)
+
+
+def test_what_a_rival_costs_that_lost() -> None:
+    explanation = explain_pair(RECTANGLE, 0, 8)
+    assert explanation.sentences == (
+        "steps 0 and 8 are one dstate in every minimal map",
+        "the best map with step 0 ≠ step 8 has 9 dstates, not 8",
+    )
+    other = solve(RECTANGLE, different=[(0, 8)], maps=1)
+    assert other.cost == explanation.different.cost
+
+
+def test_rivals_that_disagree_are_counted() -> None:
+    """Turned back, travel may stop at the place before, or skip it (G1 of docs/theory.md)."""
+    trace = Trace.from_steps("batbbb".replace("t", "b"), ["travel", "travel", "around", "travel", "travel"])
+    maps = solve(trace, maps=0).maps
+    pairs = [(i, j) for j in range(len(trace)) for i in range(j) if len({m.labels[i] == m.labels[j] for m in maps}) == 2]
+    for i, j in pairs:
+        explanation = explain_pair(trace, i, j)
+        assert explanation.verdict is Verdict.DISAGREE
+        assert explanation.same.maps == sum(m.labels[i] == m.labels[j] for m in maps)
+
+
+def test_one_in_every_map() -> None:
+    """A turn around, twice, leads back to where a travel came to."""
+    trace = Trace.from_steps("aabab", ["travel", "around", "around", "travel"])
+    explanation = explain_pair(trace, 1, 3, without=["functional_view"])
+    assert explanation.verdict is Verdict.SAME
+    derivation = explanation.derivation
+    assert derivation is not None
+    assert {"turn_stays", "turn_around_reverses", "one_dstate_per_course"} <= set(derivation.axioms)
+    check_derivation(derivation, trace, Theory(without=("functional_view",)))
+
+
+@pytest.mark.parametrize("trace", [IMPOSSIBLE, Trace.from_steps("aab", ["x", "x"], stars=None)])
+def test_mends_are_those_of_the_solver(trace: Trace) -> None:
+    theory = Theory.causal() if trace is not IMPOSSIBLE else Theory()
+    theory = theory if trace is IMPOSSIBLE else theory.replace(same=[(0, 1)])
+    explanation = explain_trace(trace, theory)
+    assert explanation.possible is False
+    assert explanation.complete
+    assert explanation.mends
+    views = dict.fromkeys([*trace.views, "unseen"])
+    mended = set()
+    for t, step in enumerate(trace.steps):
+        for view in views:
+            seen = [view if k == t else v for k, v in enumerate(trace.views)]
+            changed = Trace.from_steps(seen, list(trace.actions))  # type: ignore[arg-type]
+            if view != step.view and solve(changed, theory).status is Status.OPTIMAL:
+                mended.add(t)
+    assert {mend.step for mend in explanation.mends if mend.kind == "view"} == mended
+    if theory.same:
+        assert "same" in {mend.kind for mend in explanation.mends}
+
+
+def test_nothing_is_explained_of_a_trace_without_a_map() -> None:
+    explanation = explain_pair(IMPOSSIBLE, 0, 2)
+    assert explanation.verdict is Verdict.NO_MAP
+    assert explanation.clash == explain_trace(IMPOSSIBLE).clash
+    assert "the trace has a map" in explain_trace(RECTANGLE.prefix(9)).sentences[0]
+
+
+def test_a_limit_leaves_what_is_known() -> None:
+    explanation = explain_pair(RECTANGLE, 3, 399, limit=0.001)
+    assert explanation.verdict is Verdict.UNKNOWN
+    assert explanation.stopped == "time limit"
+    assert not explanation.proven
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "said"), [(0, 400, "from 0 to 399, got 400"), (-1, 3, "got -1"), (3, 3, "3 twice"), (True, 3, "got True")]
+)
+def test_steps_that_cannot_be_explained(first: int, second: int, said: str) -> None:
+    with pytest.raises(TraceError, match=said):
+        explain_pair(RECTANGLE, first, second)
+
+
+def test_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    impossible, rectangle = tmp_path / "impossible.jsonl", tmp_path / "rectangle.jsonl"
+    IMPOSSIBLE.save(impossible)
+    RECTANGLE.prefix(12).save(rectangle)
+    assert main(["explain", str(rectangle), "0", "8", "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data == json.loads(json.dumps(explain_pair(RECTANGLE.prefix(12), 0, 8).to_dict()))
+    assert main(["explain", str(rectangle), "0", "1", "--theory", "causal"]) == 0
+    assert "functional_view" in capsys.readouterr().out
+    assert main(["explain", str(impossible)]) == 20
+    assert "if the view at step 3 were 'b'" in capsys.readouterr().out
+    assert main(["explain", str(impossible), "0", "2"]) == 20
+    assert main(["explain", str(rectangle), "0"]) == 1
+    assert main(["explain", str(rectangle), "0", "12"]) == 1
+    assert "from 0 to 11" in capsys.readouterr().err
+    assert main(["explain", str(rectangle)]) == 0
+
+
+def test_keys_are_labels_first() -> None:
+    """`compare` reads labels out of the keys of the brute force."""
+    (ssh_map,) = solve(RECTANGLE.prefix(5)).maps
+    assert key(ssh_map)[0] == ssh_map.labels
