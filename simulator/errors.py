@@ -3,5 +3,5 @@
 from ssh_abduction.errors import SSHError
 
 
-class SimulatorError(SSHError):
+class SimulatorError(SSHError, ValueError):
     """A world, a pose or a tour that cannot be simulated. The text says what was expected, what came, and how to mend it."""

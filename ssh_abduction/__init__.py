@@ -11,12 +11,13 @@ if TYPE_CHECKING:
     from typing import Any
 
     from ssh_abduction.engines.base import Cost
-    from ssh_abduction.errors import LocaliserError, MapError, SolverError, SSHError, TheoryError, TraceError
+    from ssh_abduction.errors import LocaliserError, MapError, RangeError, SolverError, SSHError, TheoryError, TraceError
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
     from ssh_abduction.localize import Belief, Chances, Localiser
     from ssh_abduction.maps import DState, Fit, Path, Pose, SSHMap
     from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
+    from ssh_abduction.rivals.explore import Experiment, next_experiment
     from ssh_abduction.rungs import Rung, ladder
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
@@ -26,14 +27,17 @@ if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
     from ssh_abduction.trace import Action, Step, Trace
 
+    __version__: str
+
 _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
-    "errors": ("LocaliserError", "MapError", "SSHError", "SolverError", "TheoryError", "TraceError"),
+    "errors": ("LocaliserError", "MapError", "RangeError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
     "localize": ("Belief", "Chances", "Localiser"),
     "maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
     "odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
+    "rivals.explore": ("Experiment", "next_experiment"),
     "rungs": ("Rung", "ladder"),
     "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
@@ -54,6 +58,7 @@ __all__ = [
     "Cost",
     "DState",
     "Evaluation",
+    "Experiment",
     "Fit",
     "Level",
     "Localiser",
@@ -65,6 +70,7 @@ __all__ = [
     "Path",
     "Pose",
     "Progress",
+    "RangeError",
     "Rung",
     "SSHError",
     "SSHMap",
@@ -80,6 +86,7 @@ __all__ = [
     "TraceError",
     "evaluate",
     "ladder",
+    "next_experiment",
     "solve",
 ]
 
@@ -87,6 +94,11 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     import importlib
 
+    if name == "__version__":
+        from importlib.metadata import version
+
+        globals()[name] = version("ssh-abduction")
+        return globals()[name]
     for module, names in _HOMES.items():
         if name in names:
             value = getattr(importlib.import_module(f"{__name__}.{module}"), name)
@@ -96,4 +108,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "__version__"})

@@ -1,4 +1,8 @@
-"""Every error that a user can cause or mend: one root, one subclass a layer."""
+"""Every error that a user can cause or mend: one root, one subclass a layer.
+
+What bad input causes is a ValueError, too, so that programs which know nothing of this package catch it. What bad input does not cause is none: a defect of
+this program (`InternalError` of `solver/judging.py`), and what is missing on a machine, which is an SSHError alone. Limits that are over are no errors: `Solution.stopped` says so.
+"""
 
 from __future__ import annotations
 
@@ -15,24 +19,28 @@ class SSHError(Exception):
         return printable(super().__str__())  # names of files and views may hold anything
 
 
-class TraceError(SSHError):
+class TraceError(SSHError, ValueError):
     """A trace, or a file of one, is malformed."""
 
 
-class TheoryError(SSHError):
+class TheoryError(SSHError, ValueError):
     """The choices of a theory contradict each other, or the trace lacks what they need."""
 
 
-class MapError(SSHError):
+class MapError(SSHError, ValueError):
     """A map, or a file of maps, is malformed."""
 
 
-class LocaliserError(SSHError):
+class LocaliserError(SSHError, ValueError):
     """What a localiser is made of, or is asked, does not fit."""
 
 
-class SolverError(SSHError):
+class SolverError(SSHError, ValueError):
     """The solver cannot do what was asked."""
+
+
+class RangeError(SSHError, ValueError, IndexError):
+    """A step or a map that there is not. The text names the range."""
 
 
 def named(source: object) -> str:
@@ -58,6 +66,20 @@ def printable(text: str) -> str:
 def xml_text(text: str) -> str:
     """A text without the characters that XML cannot hold, or that would steer a terminal, each replaced by U+FFFD."""
     return re.sub("[^\t\n -~\u00a0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
+
+
+def checked_index(index: object, count: int, what: str) -> int:
+    """An index into `count` things, from 0; a negative one counts from the end. Raises RangeError that names the range, and TypeError where it is no whole number.
+
+    what  the things, as messages call them: steps, maps
+    """
+    if not is_whole(index):
+        raise TypeError(f"{what}: expected a whole number or a slice, got {brief(index)}")
+    found = int(index)
+    if not -count <= found < count:
+        there = f"0 to {count - 1}, or {-count} to -1 from the end" if count else "none, as there are none"
+        raise RangeError(f"{what}: expected {there}, got {brief(found)}")
+    return found % count
 
 
 def is_finite(value: object) -> TypeGuard[float]:

@@ -34,6 +34,7 @@ from scipy.optimize import linear_sum_assignment
 from ssh_abduction.errors import MapError, TraceError, brief, named
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.trace import Trace, View, checked_trace
+from ssh_abduction.words import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +98,10 @@ class Evaluation:
     true_places: int | None
     true_paths: int | None
     ambiguity: float | None
+
+    def __repr__(self) -> str:
+        which = "no map is the true one" if self.rank is None else f"map {self.rank} is the true one"
+        return f"<Evaluation: {which}, of {counted(len(self.maps), 'maps')}; the truth is told at {counted(self.steps, 'steps')}>"
 
     @property
     def rank(self) -> int | None:

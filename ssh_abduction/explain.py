@@ -18,7 +18,7 @@ import clingo
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.rules import check_rules
-from ssh_abduction.errors import TraceError, brief, is_whole
+from ssh_abduction.errors import TheoryError, TraceError, brief, is_whole
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Displacement, Equality, evidence_of
@@ -86,6 +86,8 @@ def explain(trace: Trace, theory: Theory | None = None, stop: Callable[[], bool]
     stop  asked now and then; when it returns True, Interrupted is raised
     """
     theory = checked_theory(theory).resolve(checked_trace(trace))
+    if theory.jumped:
+        raise TheoryError("jumped: expected displacements that hold where a trace is explained; leave it out (--jumped)")
     theory.check_steps(trace)
     check_rules(theory)
     whole = len(trace)

@@ -78,6 +78,8 @@ def fault_front(trace: Trace, theory: Theory | None = None, most: int = 5, limit
     Raises TheoryError where the theory has places: their axioms are not known to the engine that counts faults.
     """
     theory = checked_theory(theory or Theory.causal())
+    if theory.jumped:
+        raise TheoryError("jumped: expected no wrong displacements where faults are counted; leave it out (--jumped)")
     if theory.level != "causal":
         raise TheoryError("front: expected a causal theory, got a topological one; take Theory.causal() (--theory causal)")
     if theory.rules or theory.without or theory.prefer not in (("dstates",), ("auto",)):

@@ -18,7 +18,7 @@ from ssh_abduction.trace import Trace
 from ssh_abduction.traces import Traces
 
 
-class LearnerError(SSHError):
+class LearnerError(SSHError, ValueError):
     """The loop cannot be closed: there is no map, or the maps agree on no label."""
 
 

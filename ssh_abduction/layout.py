@@ -380,7 +380,9 @@ class _Program:
                     left -= 1
             beam = sorted(children, key=lambda state: state.value)[:BEAM]
             best = min([best, *beam], key=lambda state: state.value)
-        return {spot: (float(x) + 0.0, float(y) + 0.0) for spot, (x, y) in zip(self.spots, best.at, strict=True)}  # no -0.0
+        return {
+            spot: (round(float(x), 9) + 0.0, round(float(y), 9) + 0.0) for spot, (x, y) in zip(self.spots, best.at, strict=True)
+        }  # no -0.0
 
     def _asked(self, more: Sequence[_Condition]) -> tuple[NDArray[np.float64], float]:
         """Where the spots are best with more conditions, and what that costs, with all streets that are too near each other."""

@@ -20,14 +20,19 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ssh_abduction.errors import MapError, brief, is_finite, is_whole, is_writable, named, printable, xml_text
 from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
-from ssh_abduction.trace import View
+from ssh_abduction.trace import Trace, View
+from ssh_abduction.words import counted
 
 if TYPE_CHECKING:
     import networkx as nx
     import pandas as pd
 
     from ssh_abduction.layout import Turns
-    from ssh_abduction.trace import Trace
+
+# What files of solutions and of single maps begin with.
+SOLUTION_FORMAT, MAP_FORMAT, VERSION = "ssh-solution", "ssh-map", 1
+# Bytes that a file of maps may have: some hundred thousand maps. To read it takes ten times as much memory.
+LARGEST = 2**30
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +99,7 @@ class Path:
     order: tuple[int, ...]
 
 
-FAULTS = ("misread", "misseen", "slipped")
+FAULTS = ("misread", "misseen", "slipped", "jumped")
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,14 +108,14 @@ class Fault:
 
     step      the step
     kind      misread: the view at this step is not that of its dstate; misseen: its star is not; slipped: the action done there did not do what its
-              name says, so that nothing links this step and the next one
-    seen      the view, None for a star; or the name of the action
-    expected  the view of the dstate; None for stars and actions
+              name says, so that nothing links this step and the next one; jumped: the displacement from the step before to this one is wrong altogether
+    seen      the view, None for a star; the name of the action; or the displacement, in words
+    expected  the view of the dstate; None for all else
     cost      what it costs, in dstates
     """
 
     step: int
-    kind: Literal["misread", "misseen", "slipped"]
+    kind: Literal["misread", "misseen", "slipped", "jumped"]
     seen: View | None = None
     expected: View | None = None
     cost: float = field(default=0.0, compare=False)
@@ -120,6 +125,8 @@ class Fault:
             return f"the view at step {self.step} is misread: {self.seen}, expected {self.expected}"
         if self.kind == "misseen":
             return f"the star at step {self.step} is misread"
+        if self.kind == "jumped":
+            return f"the displacement that leads to step {self.step} is wrong: {self.seen}"
         return f"the action at step {self.step} slipped: {self.seen}"
 
 
@@ -142,6 +149,12 @@ class SSHMap:
     excused: tuple[tuple[int, int], ...] = field(default=(), compare=False)
     fit: Fit | None = field(default=None, compare=False)
     faults: tuple[Fault, ...] = ()
+
+    def __repr__(self) -> str:
+        parts = [counted(len(self.dstates), "dstates")]
+        parts += [counted(len(self.places), "places"), counted(len(self.paths), "paths")] if self.places else []
+        parts += [counted(len(self.faults), "faults")] if self.faults else []
+        return f"<SSHMap: {', '.join(parts)}; {counted(len(self.labels), 'steps')}>"
 
     def without_headings(self) -> SSHMap:
         """The same map for a theory in which places have no frames."""
@@ -211,7 +224,7 @@ class SSHMap:
     @classmethod
     def from_dict(cls, data: Any, where: str = "map") -> SSHMap:
         """The map that `to_dict` wrote. Raises MapError with the field that is wrong."""
-        read = _Reader(where)
+        read = FieldReader(where)
         record = read.mapping(data, "")
         dstates = tuple(read.dstate(s, f"dstates[{i}]") for i, s in enumerate(read.list(record, "dstates")))
         ids = {s.id for s in dstates}
@@ -243,12 +256,16 @@ class SSHMap:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the map as JSON. Raises MapError."""
-        write_map(path, json_line(self.to_dict()))
+        write_map(path, json_line({"format": MAP_FORMAT, "version": VERSION, **self.to_dict()}))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SSHMap:
         """The map that `save` wrote. Raises MapError."""
-        return cls.from_dict(read_json(path), named(path))
+        data = read_json(path)
+        if isinstance(data, Mapping) and "maps" in data:
+            raise MapError(f"{named(path)}: expected one map, got a solution; take Solution.load")
+        (ssh_map,) = maps_of(data, named(path))
+        return ssh_map
 
     def place_of(self, step: int) -> int | None:
         """The place that the robot was at in a step; None where the map has no places. Raises MapError where the trace has no such step."""
@@ -405,8 +422,14 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     """The JSON value in a file. Raises MapError that names the file and the line."""
     source = "standard input" if str(path) == "-" else named(path)
     try:
-        text = sys.stdin.buffer.read() if str(path) == "-" else FilePath(path).read_bytes()
+        text = sys.stdin.buffer.read(LARGEST + 1) if str(path) == "-" else _read_at_most(path, LARGEST)
+        if len(text) > LARGEST:
+            raise MapError(f"{source}: expected at most {LARGEST // 2**20} MiB, got more; list fewer maps (--maps)")
+        if not text.strip():
+            raise MapError(f"{source}: expected JSON, got an empty file; write it with solve --json")
         return parse_json(text.decode("utf-8"))
+    except MapError:
+        raise
     except OSError as error:
         raise MapError(f"{source}: expected a readable file of maps: {error.strerror or error}; check the path") from None
     except MemoryError:
@@ -430,17 +453,56 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         raise MapError(f"{source}: expected JSON, got {error}; write it with solve --json") from None
 
 
+def _read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
+    with FilePath(path).open("rb") as file:
+        return file.read(most + 1)
+
+
 def maps_of(data: Any, where: str) -> list[SSHMap]:
     """The maps in the JSON of `solve --json`, or the one map in the JSON of `SSHMap.save`. Raises MapError."""
     if isinstance(data, Mapping) and "maps" in data:
+        check_format(data, SOLUTION_FORMAT, where)
         if not isinstance(data["maps"], list):
             raise MapError(f"{where}: maps: expected a list, got {brief(data['maps'])}; write it with solve --json")
         return [SSHMap.from_dict(m, f"{where}: maps[{i}]") for i, m in enumerate(data["maps"])]
+    if isinstance(data, Mapping):
+        check_format(data, MAP_FORMAT, where)
     return [SSHMap.from_dict(data, where)]
 
 
-class _Reader:
-    """Checks the fields of a map, and says which one is wrong."""
+def check_format(data: Mapping[str, Any], expected: str, where: str) -> None:
+    """Whether JSON is of the format and the version that this program writes; files of before these were written say neither. Raises MapError."""
+    if "format" in data and data["format"] != expected:
+        raise MapError(f'{where}: format: expected "{expected}", got {brief(data["format"])}; write it with solve --json')
+    version = data.get("version", VERSION)
+    if version != VERSION or isinstance(version, bool):
+        raise MapError(
+            f"{where}: version: expected {VERSION}, got {brief(version)}; read it with the ssh-abduction that wrote it, or solve again"
+        )
+
+
+def check_of_trace(maps: Iterable[SSHMap], trace: Trace, where: str, *, views: bool = True) -> None:
+    """Whether maps are of a trace: they label each of its steps, with a dstate of the view that was seen there, or say that it was misread. Raises MapError.
+
+    where  how messages call what the maps are from
+    views  whether views are compared: not where the theory lets dstates have several
+    """
+    for i, ssh_map in enumerate(maps):
+        if len(ssh_map.labels) != len(trace):
+            raise MapError(
+                f"{where}: maps[{i}].labels: expected {len(trace)}, one for each step of the trace, got {len(ssh_map.labels)}; the maps are of another trace"
+            )
+        misread = {fault.step for fault in ssh_map.faults}
+        for t, (step, label) in enumerate(zip(trace.steps, ssh_map.labels, strict=True)):
+            seen, there = step.view, ssh_map.dstates[label].view
+            if views and seen is not None and seen != there and t not in misread:
+                raise MapError(
+                    f"{where}: maps[{i}]: expected view {brief(seen)} at step {t}, as the trace has it, got {brief(there)}; the maps are of another trace"
+                )
+
+
+class FieldReader:
+    """Checks the fields of what was read, and says which one is wrong."""
 
     def __init__(self, where: str) -> None:
         self.where = where
@@ -540,5 +602,5 @@ class _Reader:
 
     def pair(self, value: Any, name: str) -> tuple[int, int]:
         if not (isinstance(value, list) and len(value) == 2):
-            raise self.wrong(name, "[path, path]", value)
+            raise self.wrong(name, "a list of two numbers", value)
         return self.integer(value[0], name), self.integer(value[1], name)

@@ -129,3 +129,18 @@ def checked_covariance(value: Any, where: str) -> Covariance:
             f"{where}: expected a positive definite matrix, got {brief(value)}; give variances above 0, in square metres and square radians"
         )
     return (a, b, c), (b, e, f), (c, f, k)
+
+
+def in_words(displacement: Displacement) -> str:
+    """A displacement as it is said: 4.1 m ahead, 0.2 m left, turned 90 degrees left.
+
+    >>> in_words((4.1, -0.2, 0.0))
+    '4.1 m ahead, 0.2 m right'
+    """
+    x, y, angle = displacement
+    said = [
+        f"{abs(value):.1f} m {ways[value < 0]}" for value, ways in ((x, ("ahead", "back")), (y, ("left", "right"))) if round(abs(value), 1)
+    ]
+    if degrees := round(abs(math.degrees(angle))):
+        said.append(f"turned {degrees} degrees {'left' if angle > 0 else 'right'}")
+    return ", ".join(said) or "no move"

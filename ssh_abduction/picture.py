@@ -36,7 +36,7 @@ def svg(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> str:
 
 
 def _on_page(x: float, y: float) -> Point:
-    return x * SPACING, -y * SPACING
+    return x * SPACING + 0.0, -y * SPACING + 0.0  # no -0.0
 
 
 def _topological(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:

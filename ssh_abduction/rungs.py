@@ -59,14 +59,14 @@ class Rung:
 
 def rungs(trace: Trace, theory: Theory) -> Iterator[tuple[str, Theory]]:
     """The theories of the ladder, each with one kind of evidence more, as far as the trace has it."""
-    theory = theory.replace(star="none", displacement="none", planar=False)
+    jumped, theory = theory.jumped, theory.replace(star="none", displacement="none", planar=False, jumped=0)
     yield "views", theory
     topological = theory.level == "topological"
     if trace.has_stars:
         theory = theory.replace(star="auto" if topological else "alike")
         yield "+ star", theory
     if trace.has_displacements:
-        theory = theory.replace(displacement="use", joint=1)
+        theory = theory.replace(displacement="use", joint=1, jumped=jumped)
         yield "+ pairs", theory
         theory = theory.replace(joint=2)
         yield "+ geometry", theory

@@ -14,16 +14,17 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeAlias
+from typing import Any, BinaryIO, Literal, TypeAlias, overload
 
-from ssh_abduction.errors import TraceError, brief, is_finite, is_whole, is_writable, named
+from ssh_abduction.errors import RangeError, TraceError, brief, checked_index, is_finite, is_whole, is_writable, named
 from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
 from ssh_abduction.odometry import Covariance, Displacement, Odometry, checked_covariance, checked_displacement
 from ssh_abduction.star import SPREAD, Entry, Gateway, Openings, Star, is_four, near_quarter, parse_star
+from ssh_abduction.words import counted, that_differ
 
 View: TypeAlias = str | int
 Kind: TypeAlias = Literal["travel", "turn"]
@@ -166,6 +167,14 @@ class Step:
                 raise TraceError("covariance: expected a displacement that it belongs to, got none; add it, or leave the covariance out")
             object.__setattr__(self, "covariance", checked_covariance(self.covariance, "covariance"))
 
+    def __repr__(self) -> str:
+        told = that_differ(self)
+        if self.action is not None:
+            told["action"] = repr(self.action.name)
+        if isinstance(self.image, tuple):
+            told["image"] = f"<{counted(len(self.image), 'numbers')}>"
+        return f"Step({', '.join(f'{name}={text}' for name, text in told.items())})"
+
     @staticmethod
     def of(
         view: View,
@@ -263,6 +272,43 @@ class Trace:
     def __iter__(self) -> Iterator[Step]:
         return iter(self.steps)
 
+    @overload
+    def __getitem__(self, index: int) -> Step: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Trace: ...
+
+    def __getitem__(self, index: int | slice) -> Step | Trace:
+        """trace[3] is a step, and trace[:20] a trace: steps in a row, the last without the action that led on, the first without the displacement that led there.
+
+        Negative numbers count from the end, and a slice that reaches beyond the steps is cut, as of a list. Raises RangeError, which names the range, for a step
+        that there is not and for a slice without any; TraceError for a slice that leaves steps out.
+        """
+        if not isinstance(index, slice):
+            return self.steps[checked_index(index, len(self), "steps")]
+        start, stop, stride = index.indices(len(self))
+        if stride != 1:
+            raise TraceError(
+                f"steps: expected steps in a row, as each action leads to the next one, got every {stride}th; leave the stride out"
+            )
+        if start >= stop:
+            raise RangeError(
+                f"steps: expected a slice that holds some of 0 to {len(self) - 1}, got {start}:{stop}; a trace has one step at least"
+            )
+        if not start:
+            return self.prefix(stop)
+        here = self.prefix(stop).steps[start:]
+        # What an error message says of a step is its line in the file, which would be another one.
+        return replace(self, steps=(replace(here[0], displacement=None, covariance=None), *here[1:]), source=None)
+
+    def __repr__(self) -> str:
+        name = f" {brief(self.name, 40)}" if self.name else ""
+        actions = len({action.name for action in self.actions})
+        views = {view for view in self.views if view is not None}
+        parts = [counted(len(self), "steps"), *([counted(len(views), "views")] if views else []), counted(actions, "actions")]
+        there = {"images": any(step.image is not None for step in self), "stars": self.has_stars, "displacements": self.has_displacements}
+        return f"<Trace{name}: {', '.join(parts)}{''.join(f'; {what}' for what, is_there in there.items() if is_there)}>"
+
     @property
     def views(self) -> tuple[View | None, ...]:
         return tuple(step.view for step in self.steps)
@@ -345,6 +391,16 @@ class Trace:
         """The same trace, as if the robot had no odometry."""
         return replace(self, steps=tuple(replace(step, displacement=None, covariance=None) for step in self.steps), odometry=None)
 
+    def without_displacements_at(self, steps: Collection[int]) -> Trace:
+        """The same trace, as if the displacements that lead to these steps were not known."""
+        if not steps:
+            return self
+        unknown = set(steps)
+        return replace(
+            self,
+            steps=tuple(replace(step, displacement=None, covariance=None) if t in unknown else step for t, step in enumerate(self.steps)),
+        )
+
     def with_views(self, views: Iterable[View], confidences: Iterable[float | None] | None = None) -> Trace:
         """This trace with these views, and perhaps how probable it is that each is right, one for each step. Raises TraceError."""
         seen = _listed(views, "views")
@@ -379,6 +435,8 @@ class Trace:
                 return _parse(sys.stdin.buffer, source, source)
             with Path(path).open("rb") as file:
                 return _parse(file, source, str(path))
+        except TraceError:
+            raise
         except OSError as error:
             raise TraceError(f"{source}: expected a readable trace file: {error.strerror or error}; check the path") from None
         except ValueError as error:  # a null character in the path

@@ -134,6 +134,7 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "rules": _seldom(st.sampled_from(TOYS).map(lambda toy: (toy.rules,))),
         "misread": st.just(0.0),  # tests/test_faults.py has tests of its own
         "slipped": st.just(0.0),
+        "jumped": st.just(0.0),
         "same": _seldom(_pairs(len(trace))),
         "different": _pairs(len(trace)),
         "elsewhere": _pairs(len(trace)),

@@ -165,7 +165,9 @@ def test_streets_that_no_straight_path_holds_are_straight_one_by_one() -> None:
     found = layout(ssh_map)
     corners = {tuple(round(x) for x in spot) for spot in found.places.values()}
     assert len(corners) == 4
-    assert [math.dist(found.places[p], found.places[q]) for path in square.paths for p, q in pairwise(path.order)] == pytest.approx([1.0] * 4)
+    assert [math.dist(found.places[p], found.places[q]) for path in square.paths for p, q in pairwise(path.order)] == pytest.approx(
+        [1.0] * 4
+    )
 
 
 def test_poses_are_taken_as_they_are() -> None:
@@ -213,7 +215,7 @@ def test_the_graph_of_places_has_positions_and_streets() -> None:
         "places"
     )
     assert metric.graph["metric"] is True
-    assert {data["metres"] for _, _, data in metric.edges(data=True)} == {3.0, 6.0}
+    assert {data["metres"] for _, _, data in metric.edges(data=True)} == {3.0, 9.0}
 
 
 def test_a_map_knows_the_place_of_a_step() -> None:

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import clingo
 
 from ssh_abduction.asp.limits import POLL, LimitError, Watch, peak_memory
+from ssh_abduction.logs import log_of
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import Speedups
 
@@ -21,6 +22,8 @@ from ssh_abduction.theory.speedups import Speedups
 # memory, that grounding took; so a search is not begun where a limit would be over by then.
 PREPARING = 0.6, 1.0
 
+SLOW = 0.05  # seconds of grounding from which on the log mentions it
+_log = log_of(__name__)
 _ONE = clingo.Number(1)
 _grounding = threading.Lock()
 _under_way: set[clingo.SolveHandle] = set()  # the searches that clingo does now, each in a thread
@@ -108,8 +111,13 @@ class Control(clingo.Control):
             raise
         finally:
             _grounding.release()
-            self.seconds += time.perf_counter() - began
-            self.mebibytes += peak_memory() - before
+            seconds, mebibytes = time.perf_counter() - began, peak_memory() - before
+            self.seconds += seconds
+            self.mebibytes += mebibytes
+            if seconds > SLOW:
+                _log.debug(
+                    "clingo grounded %s in %.2f s, %.0f MiB", ", ".join(dict.fromkeys(name for name, _ in parts)), seconds, mebibytes
+                )
 
 
 class _Asked:

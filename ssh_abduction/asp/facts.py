@@ -16,6 +16,7 @@ from typing import TypeAlias
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 
 from ssh_abduction.maps import FAULTS, DState, Fault, Path, SSHMap
+from ssh_abduction.odometry import in_words
 from ssh_abduction.steps import frames
 from ssh_abduction.steps.chart import Chart, FramedChart
 from ssh_abduction.theory import encodings
@@ -80,6 +81,9 @@ def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
     facts += [f"unlinked({t})." for t, action in done.items() if action.slipped]
     if theory.misread:
         facts += [f"price(misread,{t},{theory.fault_tenths('misread', trace.steps[t])})." for t in range(start, stop)]
+    if theory.jumped:
+        moved = [t for t in range(max(start, 1), stop) if trace.steps[t].displacement is not None]
+        facts += [f"moved({t}). price(jumped,{t},{theory.fault_tenths('jumped', trace.steps[t])})." for t in moved]
     if theory.slipped:
         facts += [f"price(slipped,{t},{theory.fault_tenths('slipped', trace.steps[t])})." for t in done]
     if theory.level == "topological":
@@ -269,6 +273,8 @@ def faults_of(
             found.append(Fault(t, "misread", _view(trace, t), views[labels[t]], cost))
         elif kind == "slipped":
             found.append(Fault(t, "slipped", trace.actions[t].name, cost=cost))
+        elif kind == "jumped":
+            found.append(Fault(t, "jumped", in_words(trace.steps[t].displacement or (0.0, 0.0, 0.0)), cost=cost))
         else:
             found.append(Fault(t, "misseen", cost=cost))
     return tuple(found)
@@ -462,9 +468,14 @@ def forbidden_places(equalities: Sequence[Sequence[tuple[int, int, int]]]) -> st
     return "\n".join(forbidden_pairs(pairs) for pairs in product(*equalities))
 
 
-def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = None) -> str:
-    """The rule that these equalities of steps do not all hold; where an atom is given, only if that holds."""
+def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = None, excusable: bool = False) -> str:
+    """The rule that these equalities of steps do not all hold; where an atom is given, only if that holds.
+
+    excusable  what refuses them are displacements, and says nothing where one of these, between two of the steps, is disbelieved
+    """
     atoms = [str(where)] if where else []
+    if excusable:
+        atoms += [f"not jumped_since({e.first},{e.second})" for e in equalities]
     atoms += [
         f"{'' if e.holds else 'not '}same{'' if e.of == 'dstate' else '_place'}({min(e.first, e.second)},{max(e.first, e.second)})"
         for e in equalities

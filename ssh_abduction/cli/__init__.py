@@ -8,17 +8,33 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import errno
 import io
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
-from typing import NoReturn
+from typing import Any, NoReturn
 
-from ssh_abduction.cli import check, cluster, evaluate, facts, ladder, localize, show, simulate, solve, theory, train
+from ssh_abduction.cli import (
+    check,
+    cluster,
+    completion,
+    evaluate,
+    facts,
+    ladder,
+    localize,
+    next_experiment,
+    show,
+    simulate,
+    solve,
+    theory,
+    train,
+)
 from ssh_abduction.cli import reproduce as reproduction
+from ssh_abduction.cli.verbosity import add_verbosity, telling
 from ssh_abduction.errors import SSHError, named, printable
 
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
@@ -34,8 +50,41 @@ FOR_PROGRAMS = ("json", "facts", "dot", "graphml", "svg")  # forms that other pr
 
 
 class _Parser(argparse.ArgumentParser):
+    """Takes part in a name that is nearly one of those expected: it says which was perhaps meant."""
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            raise argparse.ArgumentError(action, f"{error.message}{_meant(value, map(str, action.choices or ()))}") from None
+
+    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        """As argparse does, but what is unknown to a verb is an error of that verb, with the option that was perhaps meant."""
+        options, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            verb = self.verbs[options.verb] if getattr(options, "verb", None) else self
+            wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
+            verb.error(f"unrecognized arguments: {' '.join(unknown)}{_meant(wrong.partition('=')[0], verb.names)}")
+        return options
+
+    @property
+    def verbs(self) -> Mapping[str, _Parser]:
+        """The parsers of the verbs."""
+        return next((action.choices for action in self._actions if isinstance(action, argparse._SubParsersAction)), {})
+
+    @property
+    def names(self) -> list[str]:
+        """The names of all options."""
+        return [name for action in self._actions for name in action.option_strings]
+
     def error(self, message: str) -> NoReturn:
         super().error(printable(message))  # which repeats what was typed
+
+
+def _meant(word: object, names: Iterable[str]) -> str:
+    """A question after the name that is nearest to a word, if one is near."""
+    near = difflib.get_close_matches(str(word), names, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -47,9 +96,26 @@ def parser() -> argparse.ArgumentParser:
         "30 nothing in time; 130 interrupted; 143 ended by SIGTERM.",
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
-    verbs = top.add_subparsers(metavar="VERB", required=True)
-    for verb in (solve, check, evaluate, ladder, localize, show, facts, theory, simulate, cluster, train, reproduction):
+    verbs = top.add_subparsers(metavar="VERB", dest="verb", required=True)
+    for verb in (
+        solve,
+        check,
+        evaluate,
+        ladder,
+        localize,
+        next_experiment,
+        show,
+        facts,
+        theory,
+        simulate,
+        cluster,
+        train,
+        reproduction,
+        completion,
+    ):
         verb.add_parser(verbs)
+    for each in (top, *verbs.choices.values()):
+        add_verbosity(each)
     return top
 
 
@@ -84,7 +150,7 @@ def _main(arguments: Sequence[str] | None) -> int:
     try:
         if sys.stdout is None:
             raise SSHError("standard output: expected a place to print to, got a closed stream; open it, or send it to a file")
-        with warnings.catch_warnings(record=True) as caught:
+        with telling(options, for_programs), warnings.catch_warnings(record=True) as caught:
             try:
                 code = int(options.run(options))
             finally:

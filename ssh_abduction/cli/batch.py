@@ -22,7 +22,6 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import Stop as SearchStop
 from ssh_abduction.cli import EXIT_ERROR, EXIT_INTERRUPTED, workers
 from ssh_abduction.cli.guard import Guard
@@ -121,7 +120,7 @@ class Question:
             for ssh_map in search:
                 maps += [told(search, ssh_map)] if self.json else []
             explanation = explained(search)
-            return self._told(number, path, search, search.solution(), maps, explanation, search.grounding, search.backbone)
+            return self._told(number, path, search, search.solution(), maps, explanation, search.backbone)
 
     def _guarded(
         self, number: int, path: str, search: Search, maps: list[dict[str, Any]], given_up: Callable[[], bool]
@@ -131,9 +130,7 @@ class Question:
         def last_words(why: SearchStop) -> tuple[Answer, int]:
             solution = search.snapshot(why)
             found = [*maps] or [ssh_map.to_dict() for ssh_map in solution.maps if self.json]
-            return self._told(
-                number, path, search, solution, found, None, Grounding(0, 0), None
-            ), EXIT_ERROR  # of the process, which nobody reads
+            return self._told(number, path, search, solution, found, None, None), EXIT_ERROR  # of the process, which nobody reads
 
         if not workers.serves():
             return contextlib.nullcontext()
@@ -147,14 +144,11 @@ class Question:
         solution: Solution,
         maps: Sequence[dict[str, Any]],
         explanation: Explanation | None,
-        grounding: Grounding,
         backbone: Backbone | None,
     ) -> Answer:
         if self.json:
             count = len(maps)
-            line = dump(
-                {"trace": path, **opening(search), "maps": maps, **ending(search, solution, explanation, count, grounding, backbone)}
-            )
+            line = dump({"trace": path, **opening(search), "maps": maps, **ending(search, solution, explanation, count, backbone)})
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
         return Answer(number, line, exit_code(solution), tuple(warnings_of(search, solution)))

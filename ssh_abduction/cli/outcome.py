@@ -7,17 +7,14 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from ssh_abduction.asp.control import Grounding
 from ssh_abduction.explain import Explanation, Interrupted, explain
 from ssh_abduction.files import json_line
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.runner_up import second_map
-from ssh_abduction.solver import Search, Solution, Status
-from ssh_abduction.solver.result import summary_of
+from ssh_abduction.solver import Search, Solution, Status, result
 from ssh_abduction.solver.sharing import Backbone
 
 SOON = 10_000  # steps of a trace in which noise is sought after Ctrl-C, at most: in 40,000 that takes two seconds
@@ -40,7 +37,7 @@ def interrupted_code() -> int:
 
 def explained(search: Search) -> Explanation | None:
     """Why there is no map, if that is so and there is time to find out."""
-    if search.status is not Status.UNSATISFIABLE:
+    if search.status is not Status.UNSATISFIABLE or search.theory.jumped:
         return None
     try:
         return explain(search.trace, search.theory, search.over)
@@ -50,57 +47,30 @@ def explained(search: Search) -> Explanation | None:
 
 def opening(search: Search) -> dict[str, Any]:
     """What the JSON of a solution says before its maps."""
-    return {"theory": search.theory.to_dict(), "steps": len(search.trace), **({"within": search.within} if search.within else {})}
+    return result.opening(search.theory, len(search.trace), search.within)
 
 
 def told(search: Search, ssh_map: SSHMap) -> dict[str, Any]:
     """What the JSON of a solution says of the map that was given last: also what it costs, where not all maps cost the same."""
-    return ssh_map.to_dict() | ({"cost": search.cost.to_dict()} if search.within and search.cost else {})
+    return result.written_map(ssh_map, search.cost if search.within else None)
 
 
-def ending(
-    search: Search, solution: Solution, explanation: Explanation | None, maps: int, grounding: Grounding, backbone: Backbone | None
-) -> dict[str, Any]:
-    """What the JSON of a solution says after its maps, of which there were so many.
+def ending(search: Search, solution: Solution, explanation: Explanation | None, maps: int, backbone: Backbone | None) -> dict[str, Any]:
+    """What the JSON of a solution says after its maps, of which there were so many: with all warnings, and why there is no map.
 
     backbone  what the minimal maps share, as far as it is known
     """
-    end: dict[str, Any] = {
-        "status": solution.status.value,
-        "complete": solution.complete,
-        "count": maps,
-        "cost": solution.cost.to_dict() if solution.cost else None,
-        "bound": solution.bound.to_dict(),
-        "prefix": solution.prefix,
-        "grounding": asdict(grounding),
-        "seconds": {k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")},
-    }
-    end["summary"] = summary_of(solution, maps, backbone)
-    if backbone and not (solution.minimal_listed and maps == 1):
-        end["backbone"] = backbone.to_dict()
-    if solution.within:
-        end["levels"] = [level.to_dict() for level in solution.levels]
-    if solution.certificate:
-        end["certificate"] = solution.certificate.to_dict(search.trace)
-    if solution.stopped:
-        end["stopped"] = solution.stopped
-    if solution.partial:
-        end["partial"] = solution.partial.to_dict()
-    if solution.evidence:
-        end["evidence"] = {name: dict(said) for name, said in solution.evidence.items()}
-    if found := warnings_of(search, solution):
-        end["warnings"] = found
-    if explanation:
-        end["explanation"] = explanation.to_dict()
-    return end
+    end = result.ending(solution, maps, backbone)
+    found = warnings_of(search, solution)
+    end.pop("warnings", None)
+    return end | ({"warnings": found} if found else {}) | ({"explanation": explanation.to_dict()} if explanation else {})
 
 
 def warnings_of(search: Search, solution: Solution) -> list[str]:
     """What makes the trace suspicious, a sentence each."""
     if solution.stopped == "interrupted" and len(search.trace) > SOON:
         return []
-    noise = [solution.noise.sentence(search.trace)] if solution.noise else []
-    return noise + ([solution.odometry_warning] if solution.odometry_warning else []) + _second_opinion(search, solution)
+    return [*solution.warnings, *_second_opinion(search, solution)]
 
 
 _second_opinions: WeakKeyDictionary[Search, list[str]] = (

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import logging
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.outcome import dump, ending, exit_code, explained, on_ctrl_c, opening, told, warn, warnings_of
 from ssh_abduction.cli.text import by_displacements, describe, describe_backbone, differences, headline
 from ssh_abduction.explain import Explanation
+from ssh_abduction.logs import PROGRESS
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.result import Progress, Solution, Status, summary_of
 from ssh_abduction.solver.search import Search
@@ -71,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
     theory = theory_of(options)
     theory.check_steps(trace)
     with contextlib.ExitStack() as until_printed:
-        with _progress(trace, options.json) as on_progress:
+        with _progress(options.json) as on_progress:
             search = Search(
                 trace,
                 theory,
@@ -142,10 +143,10 @@ class _Json:
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
         """What comes after the maps."""
-        return self._end(solution, explanation, self._search.grounding, self._search.backbone)
+        return self._end(solution, explanation, self._search.backbone)
 
-    def _end(self, solution: Solution, explanation: Explanation | None, grounding: Grounding, backbone: Backbone | None) -> str:
-        return "\n]," + dump(ending(self._search, solution, explanation, self._maps, grounding, backbone))[1:] + "\n"
+    def _end(self, solution: Solution, explanation: Explanation | None, backbone: Backbone | None) -> str:
+        return "\n]," + dump(ending(self._search, solution, explanation, self._maps, backbone))[1:] + "\n"
 
     def last_words(self, why: Stop) -> tuple[str, int]:
         """What is missing, with what is known, where the search cannot be ended in time, and the exit code."""
@@ -154,8 +155,8 @@ class _Json:
         words = "" if self._begun else self._opening()
         if not self._maps and solution.maps:
             words += self._line(solution.maps[0])
-        # Clingo is not asked while another thread is in it; nor is the backbone, which that thread may be changing.
-        return words + self._end(solution, None, Grounding(0, 0), None), exit_code(solution)
+        # The backbone is not asked for, which another thread may be changing.
+        return words + self._end(solution, None, None), exit_code(solution)
 
     def _opening(self) -> str:
         self._begun = True
@@ -194,9 +195,9 @@ def _lines(search: Search, solution: Solution, explanation: Explanation | None, 
 
 
 @contextlib.contextmanager
-def _progress(trace: Trace, prints_meanwhile: bool) -> Iterator[Any]:
-    """A line on stderr, while solving, if stderr is a terminal, unless it would come between the lines that are printed meanwhile."""
-    if not sys.stderr.isatty() or (prints_meanwhile and sys.stdout.isatty()):
+def _progress(prints_meanwhile: bool) -> Iterator[Any]:
+    """A line on stderr, while solving, if stderr is a terminal, unless it would come between the lines that are printed meanwhile, or of the log."""
+    if not sys.stderr.isatty() or (prints_meanwhile and sys.stdout.isatty()) or PROGRESS.isEnabledFor(logging.INFO):
         yield None
         return
     from rich.console import Console
@@ -208,8 +209,6 @@ def _progress(trace: Trace, prints_meanwhile: bool) -> Iterator[Any]:
     with Live(status, console=Console(stderr=True), transient=True, redirect_stdout=False, redirect_stderr=False):
 
         def show(p: Progress) -> None:
-            best = f"best {p.cost.dstates} dstates, {p.cost.places} places, {p.cost.paths} paths" if p.cost else "no map yet"
-            bound = ", ".join(f"{k} ≥ {v}" for k, v in p.bound.to_dict().items()) or "no bound yet"
-            status.update(text=f"prefix {p.prefix} of {len(trace)} steps; {best}; {bound}; {p.maps} maps; {p.seconds:.1f} s")
+            status.update(text=p.sentence)
 
         yield show

@@ -12,6 +12,7 @@ from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.solver.sharing import Backbone, stretches
 from ssh_abduction.theory.evidence import evidence_of
 from ssh_abduction.trace import Trace
+from ssh_abduction.words import counted as counted  # noqa: PLC0414 - the verbs have it from here
 
 # So many pairs of steps are told of, at most, as more cannot be taken in on a terminal.
 SHOWN_PAIRS = 12
@@ -65,11 +66,6 @@ def by_displacements(solution: Solution) -> Iterator[str]:
     weights = solution.weights
     if len(weights) > 1:
         yield f"weights of the maps by displacements alone: {', '.join(f'{weight:.2g}' for weight in weights)}"
-
-
-def counted(number: float, things: str) -> str:
-    """8 dstates, 1 dstate."""
-    return f"{number} {things.removesuffix('s') if number == 1 else things}"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -135,7 +135,7 @@ class FaultyEngine:
 
     def _guessed(self) -> Iterator[Found]:
         """Maps of the whole trace that nothing proves. What is known of the best of them clingo is told: how many names views need, and what is disbelieved."""
-        if self.size <= FEW or self._task.log.pairs.one:
+        if self.size <= FEW or self._task.log.pairs.one or not self._price:
             return
         watch = self._task.watch
         began, may_take = watch.elapsed(), min(GUESSING, GUESSING_SHARE * watch.left())

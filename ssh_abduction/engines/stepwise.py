@@ -146,7 +146,7 @@ class StepEngine:
 
     def _tell_forbidden(self, number: int) -> None:
         part = f"forbidden_{number}"
-        self.asker.control.add(part, [], facts.forbidden_equalities(self._forbidden[number]))
+        self.asker.control.add(part, [], facts.forbidden_equalities(self._forbidden[number], excusable=self._task.theory.jumped > 0))
         self.asker.control.ground([(part, [])])
 
     def _read(self, model: clingo.Model) -> Found:

@@ -144,6 +144,10 @@ class Merging:
             for _, slot in visit.steps
         ]
 
+    def places(self) -> list[int]:
+        """A number for the place of each step, as the groups have it."""
+        return [label // 4 for label in self.labels()]
+
     def _turn(self, visit: int) -> int:
         """By how many quarters a visit is turned in its group."""
         return self._groups[self._group_of[visit]].members[visit]

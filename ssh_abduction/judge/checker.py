@@ -522,11 +522,16 @@ def _faults_are_allowed(m: _Reading) -> Found:
     named: set[tuple[str, int]] = set()
     for fault in m.map.faults:
         i, kind = fault.step, fault.kind
-        allowed = {"misread": m.theory.misread, "misseen": m.theory.misread, "slipped": m.theory.slipped}.get(kind, 0)
+        prices = {"misread": m.theory.misread, "misseen": m.theory.misread, "slipped": m.theory.slipped, "jumped": m.theory.jumped}
+        allowed = prices.get(kind, 0)
         steps = m.trace.steps
         if not allowed or (kind == "misseen" and m.theory.star not in ("pattern", "frame")):
             yield [], f"The map disbelieves step {i} ({kind}), which the theory does not allow."
-        elif not 0 <= i < min(len(m.trace), len(m.map.labels)) or (kind == "slipped" and m.trace.steps[i].action is None):
+        elif (
+            not 0 <= i < min(len(m.trace), len(m.map.labels))
+            or (kind == "slipped" and m.trace.steps[i].action is None)
+            or (kind == "jumped" and m.trace.steps[i].displacement is None)
+        ):
             yield [], f"The map disbelieves step {i} ({kind}), where there is nothing to disbelieve."
         elif (kind, i) in named:
             yield [i], f"The map names the fault of step {i} ({kind}) twice."
@@ -953,7 +958,8 @@ def _one_pose(m: _Reading) -> Found:
     """A dstate has one pose, a place one position, with which the displacements agree within their covariance."""
     from ssh_abduction.judge.geometry import refused_returns  # loads numpy
 
-    for refused in refused_returns(m.trace, m.map, m.theory):
+    trusted = m.trace.without_displacements_at([fault.step for fault in m.map.faults if fault.kind == "jumped"])
+    for refused in refused_returns(trusted, m.map, m.theory):
         said = " and ".join(f"steps {i} and {j} are at one {'place' if freedom == 2 else 'dstate'}" for i, j, freedom in refused.returns)
         steps = [t for i, j, _ in refused.returns for t in (i, j)]
         yield (

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -32,6 +33,13 @@ def false_claims(answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, 
     """
     claims = _Claims(answer, maps, steps, theory, proven)
     return tuple(fault for check in (claims.sizes, claims.twice, claims.status, claims.cost, claims.bound) for fault in check())
+
+
+def contradictions(answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory) -> Iterator[str]:
+    """In what an answer contradicts itself, a sentence each. Its certificate is taken for granted, as only the trace could tell. Parameters as of `false_claims`."""
+    claims = _Claims(answer, maps, steps, theory, sys.maxsize)
+    for check in (claims.sizes, claims.twice, claims.status, *(() if theory.has_faults else (claims.cost, claims.bound))):
+        yield from check()
 
 
 class _Claims:

@@ -120,6 +120,10 @@ class OnlineMapper:
     ) -> None:
         first = replace(Step.of(view, star, "step 0"), confidence=confidence)
         theory = checked_theory(theory)
+        if theory.jumped:
+            raise TheoryError(
+                "jumped: expected displacements that hold while a robot drives; leave it out, and give no displacement at a step where the odometry is lost"
+            )
         check_limit("limit", "seconds", limit)
         checked_speedups(speedups)
         self._odometry = None if odometry is None else Odometry.of(odometry)

@@ -25,11 +25,14 @@ from ssh_abduction.asp.limits import LimitError, StageTimeError
 from ssh_abduction.engines.base import Engine, Task
 from ssh_abduction.engines.doubts import Doubt, Settled
 from ssh_abduction.engines.stepwise import StepEngine, paths_needed
+from ssh_abduction.logs import log_of
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.sharing import Backbone, Sharing
 from ssh_abduction.steps.log import Outcome, Replay
 from ssh_abduction.theory.evidence import Equality
+
+_log = log_of(__name__)
 
 # Without these axioms a dstate may be at several places, or along several courses, of which a map shows one.
 SHOWN_ONCE = frozenset({"one_place", "one_course"})
@@ -72,10 +75,12 @@ class Rivals:
         if self.listed or self._reasoned or not self.reasons or not self.sharing.maps:
             return
         self._reasoned = True
+        _log.info("what all minimal maps share is sought, from %d of them", self.sharing.maps)
         if anew:
             self._task.watch.begin_anew()
         with suppress(LimitError, StageTimeError, KeyboardInterrupt):
             self._proven = prove_backbone(self._task, self._judging, self._cost, self.sharing, self.engine)
+        _log.info("what all minimal maps share is %s", "proven" if self._proven else "not proven")
         self.engine = None
 
     @property

@@ -10,10 +10,13 @@ from ssh_abduction.asp.limits import LimitError
 from ssh_abduction.engines.base import Found, Task
 from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import unchecked
+from ssh_abduction.logs import log_of
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.theory.speedups import Speedups
+
+_log = log_of(__name__)
 
 FRAMING = 30.0  # Maps with frames are sought for so many seconds at most: what they are good for is mostly found by then.
 FRAMING_SHARE = 0.4  # Or for such a share of the time that is left, if that is less, so that clingo has the larger part.
@@ -84,5 +87,6 @@ class Candidates:
         """Keep a map of the whole trace if it is better than the best one known, and satisfies all axioms."""
         found = Found.of(ssh_map, self._task.theory)
         if self._known.is_better(found) and self._judging.accepts(ssh_map):
+            _log.info("candidate of %d dstates, %d places, %d paths", len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths))
             self._known.keep(found, ssh_map.labels)
             self._task.watch.use_reserve()

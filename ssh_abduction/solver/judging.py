@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 import time
 
-from ssh_abduction.errors import SolverError
+from ssh_abduction.errors import SSHError
 from ssh_abduction.judge.checker import Violation, check, unchecked
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.evidence import Equality, evidence_of
@@ -29,7 +29,7 @@ A_STEP = 5e-6
 UNSHOWN = frozenset({"one_place", "one_course", "one_heading", "gateway_heading"})
 
 
-class InternalError(SolverError):
+class InternalError(SSHError):
     """A map that was found breaks an axiom: a defect of this program, and not of the trace."""
 
 

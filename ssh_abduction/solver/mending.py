@@ -1,8 +1,11 @@
 """Maps with faults in theories that have places: faults are guessed and mended in the trace, and the mended trace is solved as if nothing had been wrong.
 
-To disbelieve a view is to believe another one, and to disbelieve an action is to know nothing of it. So a map with faults is a map without them of a mended trace, which
+To disbelieve a view is to believe another one, to disbelieve an action is to know nothing of it, and a displacement that is disbelieved might be missing. So a map with faults is a map without them of a mended trace, which
 all fast engines take. Where faults may be is guessed twice: by robust merging of visits (`guesses/mending.py`), where places have frames, and by the causal theory with
 faults (`engines/faulty.py`), whose maps any map with places is one of, places aside.
+
+*Displacements.* Which of them may be wrong is guessed by labels for which displacements were not asked (`guesses/jumps.py`), and by those of the maps that come of that.
+A map need not disbelieve all that were guessed: those are believed again with which it agrees.
 
 *Bound.* A map of the theory, its places taken away, is a causal map with the same dstates, and with no more faults: so what is proven of the causal theory holds here.
 Where the mended trace has a map that costs no more, its dstates and faults are minimal. And where all cheapest causal maps are listed, each minimal map of the theory has
@@ -13,15 +16,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from ssh_abduction.asp import facts
 from ssh_abduction.engines.base import Found, Task
 from ssh_abduction.engines.faulty import FaultyEngine
 from ssh_abduction.engines.framed import FramedEngine
+from ssh_abduction.guesses.jumps import wrong_displacements
 from ssh_abduction.guesses.mending import Merging
 from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver.judging import Judging
+from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Action, Step, Trace, View
@@ -45,13 +51,14 @@ class Mending:
 
     def __init__(self, task: Task, solver: Solver) -> None:
         self._task, self._solver = task, solver
-        self._without_faults = task.theory.replace(misread=0, slipped=0)
+        self._without_faults = task.theory.without_faults()
         # The best map of each mended trace that was solved, and whether it is known to be minimal. One that is not is sought once more where there is more time.
         self._solved: dict[Trace, tuple[Found | None, bool]] = {}
         self._best: Found | None = None
         self._best_mended: Trace | None = None
         self._cheapest: list[Trace] = []  # what all causal maps mend that cost the least, once these are known
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
+        self._causal_labels: tuple[int, ...] = ()  # of the last causal map
         # The log is that of the theory: so stars tell dstates apart, and so do pairs of steps that are not at one place.
         self._causal = FaultyEngine(replace(task, theory=causal))
 
@@ -66,9 +73,16 @@ class Mending:
 
     def maps(self) -> Iterator[Found]:
         """Maps of the whole trace, each better than the one before."""
-        yield from self._by_merging()
+        if self._task.theory.jumped and self._task.theory.star == "frame":
+            merging = Merging(self._task.trace, self._task.theory, self._task.log.pairs, self._task.watch.check)
+            merging.merge()
+            yield from self._by_missing_displacements(merging.labels(), merging.places())
+        yield from self._by_merging(self._task.trace)
         for mended in self._by_causal_maps():
             yield from self._improving(self._minimal(mended)[0], mended)
+            if self._task.theory.jumped:
+                labels = self._causal_labels
+                yield from self._by_missing_displacements(labels, [None] * len(labels))
         for mended in self._by_cheapest_causal_maps():
             yield from self._improving(self._minimal(mended)[0], mended)
         yield from self._by_rare_dstates()
@@ -95,34 +109,53 @@ class Mending:
             self._best, self._best_mended = better, mended
             yield better
 
-    def _by_merging(self) -> Iterator[Found]:
+    def _by_merging(self, trace: Trace) -> Iterator[Found]:
         """Maps of what robust merging mends; then once more from the places of the best map, while that gets better.
 
         The merged groups are nearly a map, which is there at once; what is better is sought for a share of the time.
+
+        trace  that of the task, some displacements of which may be missing
         """
         theory = self._task.theory
-        if theory.star != "frame" or not theory.misread:
+        if theory.star != "frame" or not (theory.misread or theory.jumped):
             return
         before: Found | None = None
+        pairs = pairs_of(trace, self._without_faults)
         for _ in range(ROUNDS):
-            merging = Merging(self._task.trace, theory, self._task.log.pairs, self._task.watch.check)
+            merging = Merging(trace, theory, pairs, self._task.watch.check)
             if before is not None:
                 merging.start_from(_places(before.map))
             merging.merge()
             mended = merging.mended()
             task = Task.of(mended, self._without_faults, self._task.watch, self._task.speedups)
             near = FramedEngine(task).map_mended_from(merging.labels()) if _has_frames(task) else None
-            if near is not None:
+            if near is not None and not Judging(mended, self._without_faults).why_refused(near.map):
                 yield from self._improving(self._as_found(near.map, mended), mended)
             yield from self._improving(self._minimal(mended, MERGED)[0], mended)
             if self._best is before:
                 return
             before = self._best
 
+    def _by_missing_displacements(self, labels: Sequence[int], places: Sequence[int | None]) -> Iterator[Found]:
+        """Maps in which displacements are disbelieved, at first those that do not fit the given labels; then once more by those of the best map, while that gets better."""
+        trace, tried = self._task.trace, set()
+        for _ in range(ROUNDS):
+            wrong = wrong_displacements(trace, labels, places)
+            if not wrong or wrong in tried:
+                return
+            tried.add(wrong)
+            before, without = self._best, trace.without_displacements_at(wrong)
+            yield from self._by_merging(without)
+            yield from self._improving(self._minimal(without, MERGED)[0], without)
+            if self._best is None or self._best is before:
+                return
+            labels, places = self._best.map.labels, [self._best.map.dstates[label].place for label in self._best.map.labels]
+
     def _by_causal_maps(self) -> Iterator[Trace]:
         """What causal maps mend, each cheaper than the one before."""
         self._causal.grow(len(self._task.trace))
         for found in self._causal.improving_maps():
+            self._causal_labels = found.map.labels
             yield self._mended(found.map)
 
     def _by_cheapest_causal_maps(self) -> Iterator[Trace]:
@@ -187,8 +220,25 @@ class Mending:
         maps, proven = self._solver(mended, self._without_faults, most, min(seconds, SHARE * self._task.watch.left()))
         return list(maps), proven
 
+    def _believed_again(self, ssh_map: SSHMap, mended: Trace) -> Trace:
+        """A mended trace with as many of its missing displacements as a map agrees with, one after the other."""
+        for t, (step, other) in enumerate(zip(self._task.trace.steps, mended.steps, strict=True)):
+            if step.displacement == other.displacement:
+                continue
+            steps = list(mended.steps)
+            steps[t] = replace(other, displacement=step.displacement, covariance=step.covariance)
+            again = replace(mended, steps=tuple(steps))
+            pairs = pairs_of(again, self._without_faults)
+            place_of = [s.place for s in ssh_map.dstates]
+            fits = all(pairs.allow(k, ssh_map.labels, place_of) for k in range(len(again)))
+            if fits and not Judging(again, self._without_faults).why_refused(replace(ssh_map, faults=())):
+                mended = again
+        return mended
+
     def _as_found(self, ssh_map: SSHMap, mended: Trace) -> Found:
         """A map of a mended trace as one of the trace itself."""
+        if self._task.theory.jumped:
+            mended = self._believed_again(ssh_map, mended)
         return Found.of(with_faults(ssh_map, self._task.trace, mended, self._task.theory), self._task.theory)
 
 
@@ -218,6 +268,8 @@ def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) ->
             faults.append((t, "misseen"))
         if step.action != other.action:
             faults.append((t, "slipped"))
+        if step.displacement != other.displacement:
+            faults.append((t, "jumped"))
     told = facts.faults_of(faults, dict(enumerate(ssh_map.labels)), shows, trace, theory)
     dstates = tuple(replace(s, view=shows[s.id]) for s in ssh_map.dstates)
     return replace(ssh_map, dstates=dstates, links=facts.links_of(ssh_map.labels, trace, faults), faults=told)

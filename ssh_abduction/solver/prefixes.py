@@ -14,12 +14,15 @@ from ssh_abduction.engines.base import Engine, Found, Task
 from ssh_abduction.engines.refusing import first_accepted
 from ssh_abduction.engines.stepwise import StepEngine, paths_needed
 from ssh_abduction.judge.checker import turned
+from ssh_abduction.logs import log_of
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.result import Status
 from ssh_abduction.steps.log import Outcome, Replay
 from ssh_abduction.theory.evidence import Equality
+
+_log = log_of(__name__)
 
 FIRST_PREFIX = 8  # The first prefix has so many steps: solving it costs next to nothing.
 HELD_BACK = 1000  # So many maps are kept until a prefix proves long enough; from there on they stream, so that memory stays constant.
@@ -57,6 +60,7 @@ class Prefixes:
         while True:
             if size == steps:
                 self._task.watch.use_reserve()  # which is for a search like this one
+            _log.debug("%s is given %d of %d steps", type(self.engine).__name__, size, steps)
             self.engine.grow(size)
             minimal = self.minimise()
             if minimal is None:
@@ -64,6 +68,7 @@ class Prefixes:
                 return
             self._known.raise_lower(minimal.cost)
             replayed = self._replay(minimal.map)
+            _log.debug("its minimal cost is %s; its map explains %d steps", minimal.cost, len(replayed.labels))
             if self._predicts_all(minimal, replayed):
                 self._known.keep(replace(minimal, map=self._whole(minimal.map, replayed)), replayed.labels)
             if self._known.best is not None and self._known.cost <= minimal.cost:  # a map of the whole trace, as cheap as any of the prefix
@@ -79,6 +84,7 @@ class Prefixes:
             if refusal is None:
                 return None
             name, equalities = refusal
+            _log.debug("%s refuses a map, for %d equalities", name, len(equalities))
             self._known.refused[name] = self._known.refused.get(name, 0) + 1
             return equalities
 
@@ -89,6 +95,7 @@ class Prefixes:
         can_be_told = isinstance(self.engine, StepEngine) or all(equality.holds for equality in equalities)
         if can_be_told and self.engine.forbid(equalities):
             return
+        _log.debug("%s cannot be told so: the readable encodings go on", type(self.engine).__name__)
         self.engine.settle()
         size, theory = self.engine.size, self._task.theory
         self.engine = StepEngine(self._task, facts.most_paths(self._task.trace, theory, len(self._task.trace)))
@@ -123,6 +130,7 @@ class Prefixes:
         if needed <= self.engine.paths:
             return False
         size = self.engine.size
+        _log.debug("%d names for paths are needed, not %d", needed, self.engine.paths)
         self.engine = self.engine.with_paths(needed)
         self.engine.grow(size)
         return True

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import TypeAlias
 
 from ssh_abduction.maps import Fit, SSHMap
+from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.trace import Trace
 
 # So many maps are ranked, at most; of a longer list those that come later stay in the order in which they are found, so that memory stays constant.
@@ -21,7 +22,7 @@ STANDING = 2.0
 # Displacements that agree to the last digit would make it 0.
 NEVER_LESS = 0.01
 
-_Key: TypeAlias = tuple[tuple[int, ...], tuple[int | None, ...]]
+_Key: TypeAlias = tuple[tuple[int, ...], tuple[int | None, ...], tuple[int, ...]]
 
 
 class Ranking:
@@ -35,9 +36,9 @@ class Ranking:
         """The same map, with how well it closes."""
         from ssh_abduction.fit import fit  # loads scipy
 
-        key = ssh_map.labels, tuple(s.place for s in ssh_map.dstates)
+        key = ssh_map.labels, tuple(s.place for s in ssh_map.dstates), jumped(ssh_map)
         if key not in self._known:
-            self._known[key] = fit(self._trace, ssh_map)
+            self._known[key] = fit(self._trace.without_displacements_at(jumped(ssh_map)), ssh_map)
         return replace(ssh_map, fit=self._known[key])
 
     def ranked(self, maps: Iterator[SSHMap], over: Callable[[], bool]) -> Iterator[SSHMap]:

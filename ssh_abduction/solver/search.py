@@ -39,6 +39,7 @@ that is known; any other is solved in one go.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -53,6 +54,7 @@ from ssh_abduction.asp.rules import check_rules
 from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Found, Task, cost_as_counted
 from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.errors import SolverError, TheoryError, brief
+from ssh_abduction.logs import PROGRESS, log_of
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.backbone import Rivals
@@ -69,6 +71,7 @@ from ssh_abduction.theory.evidence import evidence_of, said_by
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Trace, checked_trace
+from ssh_abduction.words import counted
 
 FEW_STEPS = 24  # Traces up to this length skip names and greedy maps: solving them directly is faster.
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.
@@ -78,6 +81,7 @@ READABLE = 60  # Traces up to so many steps are given to the readable encodings,
 SHORTEST = 0.05  # A trace that was mended has so many seconds at least.
 REASONING = 5.0  # For so many seconds it is sought what all minimal maps share, where the search took less and has no time limit.
 ALL = Speedups()
+_log = log_of(__name__)
 
 
 def solve(
@@ -175,6 +179,7 @@ class Search:
         self._goes_on = after is not None
         self._asked_speedups = checked_speedups(speedups)
         self._on_progress = on_progress
+        self._news: tuple[Cost | None, Bound] = (None, Bound())  # what was known at the last report
         self._watch = Watch(limit, memory, self._report)
         self.limit, self.memory = limit, memory
         self._task = Task.of(trace, self.theory, self._watch, speedups)
@@ -187,6 +192,10 @@ class Search:
         if after:
             self._take_over(after, minimal)
 
+    def __repr__(self) -> str:
+        best = f", best {counted(len(self.best.dstates), 'dstates')}" if self.best else ""
+        return f"<Search of {counted(len(self.trace), 'steps')}: {self.status.value}{best}, {counted(self.count, 'maps')} given>"
+
     def _new_engine(self) -> Engine:
         """The engine that suits the theory and the length of the trace."""
         if self._may_name():  # loads numpy, which takes longer than to solve a short trace
@@ -194,7 +203,7 @@ class Search:
             from ssh_abduction.engines.faulty import FaultyEngine
             from ssh_abduction.engines.framed import FramedEngine
 
-            if self.theory.has_faults and self.theory.level == "causal":
+            if row("named dstates with faults").holds_for(self.theory):
                 return FaultyEngine(self._task)
             if not self.theory.has_faults:
                 return CausalEngine(self._task) if self.theory.level == "causal" else FramedEngine(self._task)
@@ -305,6 +314,7 @@ class Search:
         if self._begun:
             raise SolverError("search: expected to be iterated once, got a second time; make another Search")
         self._begun = True
+        _log.info("search of %r under %r, with %s", self.trace, self.theory, _name(self._engine))
         self._watch.start()
         try:
             self._make_first_map()
@@ -325,6 +335,13 @@ class Search:
         yield from self._give_best_map()
         if self._reasons:
             self._reason()
+        _log.info(
+            "ended after %.2f s%s: %s, %s",
+            self._watch.elapsed(),
+            f" ({self.stopped})" if self.stopped else "",
+            self.status.value,
+            self._told,
+        )
 
     def _make_first_map(self) -> None:
         """Make a causal map at once, that clingo has to better."""
@@ -346,8 +363,10 @@ class Search:
         may_frame = takes_all and self._task.speedups.framing
         may_settle = takes_all and self._task.speedups.ways and self._asked_speedups.names
         if (may_frame or may_settle) and not self._find_minimum_soon():
+            _log.info("no minimum after %.1f s step by step", self._watch.elapsed())
             self._prefixes.start = max(self._prefixes.start, self.prefix)
             if may_frame:
+                _log.info("maps in which places have frames are sought as candidates")
                 self._candidates.frame(self._asked_speedups)
             if may_settle:
                 self._settle_dstates_first()
@@ -359,6 +378,7 @@ class Search:
         from ssh_abduction.solver.mending import Mending  # loads numpy
 
         self._mends = True
+        _log.info("maps with faults are sought by mending the trace")
         mending = Mending(self._task, self._solve_mended)
         self._watch.use_reserve()
         try:
@@ -414,11 +434,13 @@ class Search:
         if self.best is not None:
             from ssh_abduction.engines.frameless import FramelessEngine
 
+            _log.info("dstates are settled before places and paths, from a map of %d dstates", len(self.best.dstates))
             self._prefixes.go_on_with(FramelessEngine(self._task, labels), len(self.trace))
 
     def _list_maps(self) -> Iterator[SSHMap]:
         """Give the maps, as many as were asked for, once they have passed the checker. The clock stands still while the caller has one."""
         if self.status is Status.OPTIMAL:
+            _log.info("minimal maps cost %s; they are listed", self._told_cost)
             ends = self._watch.reserve_begins if self._reasons else math.inf
             ends = ends if ends > self._watch.elapsed() else math.inf
             self._watch.end_stage_after(ends)
@@ -479,6 +501,7 @@ class Search:
 
     def _salvage(self) -> None:
         """In the last part of the time limit, look for any map of the whole trace."""
+        _log.info("in the last part of the time limit any map is sought")
         self._watch.use_reserve()
         self._watch.start()
         self._known.lower = None  # a map as cheap as proved is what was not found
@@ -527,6 +550,9 @@ class Search:
 
     def solution(self, maps: tuple[SSHMap, ...] = ()) -> Solution:
         """How the search ended, with the maps that the caller kept."""
+        return self._solution(maps, self.grounding)
+
+    def _solution(self, maps: tuple[SSHMap, ...], grounding: Grounding) -> Solution:
         asker = self._engine.asker
         # Perhaps the search ended while the prefix was given to clingo: then what shows the bound is sought in all steps.
         ran_out = self.stopped not in (None, "maps limit")
@@ -547,6 +573,8 @@ class Search:
             within=self.within,
             levels=tuple(self._levels),
             rivals=self._rivals,
+            trace=self.trace,
+            grounding=grounding,
             evidence=said_by(evidence_of(self.theory), self.trace, self._known.refused),
             odometry_warning=(units_warning(self.trace) or noise_warning(self._first.fit)) if self._first and self._first.fit else None,
         )
@@ -564,7 +592,8 @@ class Search:
         if best is not None and self.status is Status.UNKNOWN:
             self._known.status = Status.FEASIBLE
         self._known.stopped = stopped
-        return replace(self.solution(() if best is None else (best,)), complete=self.status is Status.UNSATISFIABLE)
+        # Clingo is not asked how large its program is while another thread is in it.
+        return replace(self._solution(() if best is None else (best,), Grounding(0, 0)), complete=self.status is Status.UNSATISFIABLE)
 
     def _basis_of(self, size: int) -> Basis | None:
         """What shows that no map has fewer dstates: of the first `size` steps."""
@@ -582,6 +611,25 @@ class Search:
             self._known.bound = replace(self.bound, dstates=max(apart, self.bound.dstates or 0))
 
     def _report(self) -> None:
+        if self._on_progress is None and not PROGRESS.isEnabledFor(logging.INFO):
+            return
+        progress = Progress(self.prefix, len(self.trace), self._known.best_cost, self.bound, self.count, self._watch.elapsed())
+        news = (progress.cost, progress.bound)
+        PROGRESS.log(logging.DEBUG if news == self._news else logging.INFO, "%s", progress.sentence)
+        self._news = news
         if self._on_progress is not None:
-            steps, seconds = len(self.trace), self._watch.elapsed()
-            self._on_progress(Progress(self.prefix, steps, self._known.best_cost, self.bound, self.count, seconds))
+            self._on_progress(progress)
+
+    @property
+    def _told_cost(self) -> str:
+        cost = self._known.best_cost
+        return "nothing that is counted" if cost is None else ", ".join(counted(v, k) for k, v in cost.to_dict().items())
+
+    @property
+    def _told(self) -> str:
+        """How many maps were given, and whether these are all."""
+        return f"{counted(self.count, 'maps')}{'' if self.complete else ', perhaps not all'}"
+
+
+def _name(engine: Engine) -> str:
+    return type(engine).__name__

@@ -5,8 +5,11 @@
 >>> shared = Sharing()
 >>> shared.absorb(SSHMap((0, 0, 1), (a, b), ()))
 >>> shared.absorb(SSHMap((0, 1, 1), (a, b), ()))
->>> shared.backbone(proven=True).dstates
-Shared(always=(0, 1, 2), sometimes=((0, 1), (1, 2)))
+>>> backbone = shared.backbone(proven=True)
+>>> backbone
+<Backbone: the dstates of steps 1–2 differ>
+>>> backbone.dstates.always, backbone.dstates.sometimes
+((0, 1, 2), ((0, 1), (1, 2)))
 """
 
 from __future__ import annotations
@@ -17,7 +20,8 @@ from itertools import combinations
 from typing import Any, Literal, TypeAlias
 
 from ssh_abduction.engines.doubts import Sort
-from ssh_abduction.maps import DState, SSHMap
+from ssh_abduction.maps import DState, FieldReader, SSHMap
+from ssh_abduction.words import counted
 
 Pair: TypeAlias = tuple[int, int]
 
@@ -44,6 +48,10 @@ class Shared:
     always: tuple[int, ...]
     sometimes: tuple[Pair, ...]
 
+    def __repr__(self) -> str:
+        pairs = f"; {counted(len(self.sometimes), 'pairs')} of steps differ" if self.sometimes else ""
+        return f"<Shared: {len(set(self.always))} among {counted(len(self.always), 'steps')}{pairs}>"
+
     def one_in(self, i: int, j: int) -> Literal["all", "some", "none"]:
         """Whether two steps are one in all maps, in some, or in none."""
         if self.always[i] == self.always[j]:
@@ -56,6 +64,19 @@ class Shared:
         """The steps in which the maps differ: those which are one with an earlier step in some maps and not in others, and all that go with these."""
         numbers = {self.always[later] for _, later in self.sometimes}
         return tuple(t for t, number in enumerate(self.always) if number in numbers)
+
+    @classmethod
+    def read(cls, read: FieldReader, data: Any, name: str, which: Sequence[int]) -> Shared:
+        """What `to_dict` wrote. `which` of its numbers is that of each step. Raises MapError."""
+        record = read.mapping(data, name)
+        numbers = [read.integer(number, f"{name}.always[{i}]") for i, number in enumerate(read.list(record, "always"))]
+        if len(numbers) != max(which) + 1:
+            raise read.wrong(f"{name}.always", f"{max(which) + 1} numbers", len(numbers))
+        pairs = tuple(read.pair(pair, f"{name}.sometimes[{i}]") for i, pair in enumerate(read.list(record, "sometimes")))
+        for i, pair in enumerate(pairs):
+            if not 0 <= min(pair) <= max(pair) < len(which):
+                raise read.wrong(f"{name}.sometimes[{i}]", f"two steps from 0 to {len(which) - 1}", list(pair))
+        return cls(tuple(numbers[i] for i in which), pairs)
 
     def to_dict(self, steps: Iterable[int]) -> dict[str, Any]:
         """The numbers of these steps, and the pairs: if there are more than PRINTED, as many of them, and their count."""
@@ -77,6 +98,9 @@ class Backbone:
     paths: Shared | None
     courses: Shared | None
     proven: bool
+
+    def __repr__(self) -> str:
+        return f"<Backbone{'' if self.proven else ' (not proven)'}: {self.sentence}>"
 
     @property
     def sorts(self) -> dict[Sort, Shared]:
@@ -102,6 +126,22 @@ class Backbone:
             sort: shared.to_dict(range(len(labels)) if sort == "dstates" else by_dstate) for sort, shared in self.sorts.items()
         }
         return {"proven": self.proven, **told}
+
+    @classmethod
+    def from_dict(cls, data: Any, steps: int, where: str = "backbone") -> Backbone | None:
+        """The backbone that `to_dict` made plain data of, for so many steps; None where some pairs were left out there. Raises MapError.
+
+        where  how messages call what it is from
+        """
+        read = FieldReader(where)
+        record = read.mapping(data, "backbone")
+        if not isinstance(record.get("proven"), bool):
+            raise read.wrong("backbone.proven", "true or false", record.get("proven"))
+        labels = Shared.read(read, record.get("dstates"), "backbone.dstates", tuple(range(steps)))
+        others = {sort: Shared.read(read, record[sort], f"backbone.{sort}", labels.always) for sort in SORTS[1:] if sort in record}
+        if any("pairs" in record[sort] for sort in SORTS if sort in record):
+            return None
+        return cls(labels, others.get("places"), others.get("paths"), others.get("courses"), record["proven"])
 
 
 class Sharing:

@@ -18,6 +18,7 @@ from typing import Any
 from ssh_abduction.errors import SolverError
 from ssh_abduction.steps.noise import Noise, noise_in
 from ssh_abduction.trace import Trace
+from ssh_abduction.words import counted
 
 RESTS_ON = frozenset({"functional_view", "deterministic"})  # the axioms that make apart steps different dstates
 # A certificate in a file has its words only if they have at most this many actions in all, some megabytes. Where steps look alike for long, words grow with
@@ -36,6 +37,10 @@ class Certificate:
     clique: tuple[int, ...]
     refuted: tuple[int, ...] = ()
 
+    def __repr__(self) -> str:
+        refuted = f", and clingo refuted {counted(len(self.refuted), 'sizes')}" if self.refuted else ""
+        return f"<Certificate: at least {counted(self.bound, 'dstates')}; {counted(len(self.clique), 'steps')} are pairwise apart{refuted}>"
+
     @property
     def bound(self) -> int:
         """The number of dstates that every map has at least."""
@@ -45,8 +50,10 @@ class Certificate:
         """For each pair of steps of the clique the common actions that lead from them to different views. Raises SolverError."""
         return {pair: _word(trace, *pair) for pair in combinations(self.clique, 2)}
 
-    def to_dict(self, trace: Trace) -> dict[str, Any]:
-        """Plain data. Pairs that show different views at once need no word and are left out. Words of more than WRITTEN actions in all are left out, too."""
+    def to_dict(self, trace: Trace | None) -> dict[str, Any]:
+        """Plain data. Pairs that show different views at once need no word and are left out. Words of more than WRITTEN actions in all are left out, too, and so are all words where the trace is not at hand."""
+        if trace is None:
+            return {"clique": list(self.clique), "refuted": list(self.refuted)}
         words: list[list[Any]] = []
         written = 0
         for i, j in combinations(self.clique, 2):

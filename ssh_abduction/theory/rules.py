@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from ssh_abduction.errors import TheoryError, brief
@@ -26,7 +26,7 @@ class Rules:
     """A file of rules: its name, for messages, and its text. `ssh_abduction.asp.rules` says whether clingo can read it."""
 
     name: str
-    text: str
+    text: str = field(repr=False)
 
     @property
     def axioms(self) -> tuple[Axiom, ...]:

@@ -20,7 +20,8 @@ from typing import Final
 
 from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.theory import Theory
+from ssh_abduction.theory.theory import EXCUSED, Theory
+from ssh_abduction.words import shortly
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +46,9 @@ class Speedups:
         for name in SPEEDUPS:
             if not isinstance(getattr(self, name), bool):
                 raise SolverError(f"speedups: {name}: expected true or false, got {brief(getattr(self, name))}")
+
+    def __repr__(self) -> str:
+        return shortly(self)
 
     @classmethod
     def without(cls, names: str | Iterable[str]) -> Speedups:
@@ -226,10 +230,10 @@ TABLE = (
     Speedup(
         "mending",
         "names",
-        "Places and faults: guess the faults, mend the trace, and solve it without faults; causal maps with faults say what is minimal.",
-        lambda theory: theory.level == "topological" and theory.has_faults and not theory.without,
+        "Places, or displacements that may be wrong, and faults: guess the faults, mend the trace, and solve it without; causal maps with faults say what is minimal.",
+        lambda theory: (theory.level == "topological" or theory.jumped > 0) and theory.has_faults and not theory.without,
         NOTHING,
-        lambda: SURVIVE_A_CUT | {f"{axiom}, excusable" for axiom in SURVIVE_A_CUT} | {"the field misread", "the field slipped"},
+        lambda: SURVIVE_A_CUT | {f"{axiom}, excusable" for axiom in SURVIVE_A_CUT} | {f"the field {kind}" for kind in EXCUSED},
     ),
     Speedup(
         "visits",

@@ -20,6 +20,7 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.trace import Step, Trace
+from ssh_abduction.words import shortly
 
 Count: TypeAlias = Literal["dstates", "paths", "places", "excuses", "auto", "tenths"]
 Pair: TypeAlias = tuple[int, int]  # of steps
@@ -53,6 +54,7 @@ EXCUSED = {
         "course_needs_travel",
         "turn_rotates",
     },
+    "jumped": {"one_pose"},
 }
 # A step of little confidence costs so many times the price, and one that is all sure so many times: no view is so sure that nothing else could be wrong instead.
 LEAST_SURE, MOST_SURE = 0.1, 5.0
@@ -101,6 +103,7 @@ class Theory:
     returns          how many returns of the trace may be true, among which `reject` is shared; 0 counts them in the trace
     misread          how many dstates a view, or a star, costs that is not that of its dstate, to a tenth; 0 where none may be
     slipped          how many dstates an action costs that did not do what its name says, to a tenth; 0 where none may be
+    jumped           how many dstates a displacement costs that is wrong altogether, as that of a robot which was carried away, to a tenth; 0 where none may be
     planar           paths meet at places only: the map can be drawn in the plane, with turns right to the right, without a crossing
     prefer           what is minimised, first to last: dstates, paths, places, and with boundary=defeasible excuses, which go first
                      unless they are named; what is not named is not minimised. auto is dstates,places,paths where displacements are used,
@@ -132,6 +135,7 @@ class Theory:
     elsewhere: tuple[Pair, ...] = ()
     misread: float = 0.0
     slipped: float = 0.0
+    jumped: float = 0.0
 
     def __post_init__(self) -> None:
         for name, values in CHOICES.items():
@@ -160,6 +164,9 @@ class Theory:
         if "excuses" in self.prefer and self.boundary != "defeasible":
             raise TheoryError(f"prefer: expected no excuses with boundary={self.boundary}; take {_choice('boundary', 'defeasible')}")
 
+    def __repr__(self) -> str:
+        return shortly(self)
+
     def _check_faults(self) -> None:
         if self.prefer != AUTO and self.prefer[:1] != ("dstates",):
             raise TheoryError(
@@ -172,6 +179,10 @@ class Theory:
         if self.boundary == "defeasible":
             raise TheoryError(
                 f"boundary: expected no excuses where faults are allowed, got defeasible; take {_choice('boundary', 'strict')}"
+            )
+        if self.jumped and self.displacement == "none":
+            raise TheoryError(
+                f"jumped: expected displacements to be used, which may be wrong, got displacement=none; leave it out, or take {_choice('displacement', 'auto')}"
             )
         if self.planar:
             raise TheoryError("planar: expected no planarity where faults are allowed; leave it out (--no-planar)")
@@ -245,7 +256,7 @@ class Theory:
         """What is minimised, first to last, with the excuses of boundary=defeasible in their place. With displacement=auto, that of a trace without displacements."""
         prefer = self.prefer
         if self.has_faults:
-            return ("tenths", *(count for count in (replace(self, misread=0, slipped=0).priorities) if count != "dstates"))
+            return ("tenths", *(count for count in self.without_faults().priorities if count != "dstates"))
         if prefer == AUTO:
             prefer = ("dstates",) if self.level == "causal" else WITH_DISPLACEMENTS if self.displacement == "use" else PREFERRED
         if self.boundary == "defeasible" and "excuses" not in prefer:
@@ -255,17 +266,21 @@ class Theory:
     @property
     def has_faults(self) -> bool:
         """Whether a map may disbelieve what the trace says of some steps."""
-        return self.misread > 0 or self.slipped > 0
+        return any(getattr(self, kind) > 0 for kind in EXCUSED)
+
+    def without_faults(self) -> Theory:
+        """This theory, where nothing of the trace may be disbelieved."""
+        return replace(self, **dict.fromkeys(EXCUSED, 0.0))  # type: ignore[arg-type]
 
     def fault_tenths(self, kind: str, step: Step) -> int:
         """What it costs to disbelieve a step, in tenths of dstates; 0 where the theory allows no such fault.
 
         What is seen costs less where the step's confidence is small, as log odds: that of 0.99, which is also that of a step without one, costs the whole price.
 
-        kind  misread (the view), misseen (the star), or slipped (the action done there)
+        kind  misread (the view), misseen (the star), slipped (the action done there), or jumped (the displacement that led there)
         """
-        price = 10 * (self.slipped if kind == "slipped" else self.misread)
-        if not price or kind == "slipped" or step.confidence is None:
+        price = 10 * (getattr(self, kind) if kind in ("slipped", "jumped") else self.misread)
+        if not price or kind in ("slipped", "jumped") or step.confidence is None:
             return round(price)
         c = min(step.confidence, 1 - 1e-12)
         odds = math.log(c / (1 - c)) / math.log(99) if c > 0 else 0.0

@@ -58,5 +58,5 @@ def said_by(kinds: Iterable[Evidence], trace: Trace, refused: Mapping[str, int])
 
 
 def pairs_of(trace: Trace, theory: Theory) -> Pairs:
-    """What all evidence says of pairs of steps of a trace."""
-    return Pairs.joined([evidence.pairs(trace) for evidence in evidence_of(theory)])
+    """What all evidence says of pairs of steps of a trace that nothing excuses."""
+    return Pairs.joined([evidence.pairs(trace) for evidence in evidence_of(theory) if evidence.axiom in theory.hard])

@@ -62,7 +62,9 @@ class Displacement:
     @classmethod
     def of(cls, theory: Theory) -> Displacement:
         topological, hard = theory.level == "topological", theory.hard
-        return cls(theory.reject, theory.joint, theory.returns, topological, "turn_stays" in hard, "functional_view" in hard)
+        # Where displacements may be wrong, each pair of steps is excused by what lies between its own steps: so it does not stand for others of its visits.
+        turns_stay = "turn_stays" in hard and not theory.jumped
+        return cls(theory.reject, theory.joint, theory.returns, topological, turns_stay, "functional_view" in hard)
 
     def pairs(self, trace: Trace) -> Pairs:
         return self.returns_of(trace).pairs
@@ -71,11 +73,18 @@ class Displacement:
         return ""
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        return self.returns_of(trace).refused_together(ssh_map, since) if self.joint > 1 else None
+        if self.joint <= 1:
+            return None
+        return self.returns_of(trace.without_displacements_at(jumped(ssh_map))).refused_together(ssh_map, since)
 
     def returns_of(self, trace: Trace) -> Returns:
         """The returns that a trace may have."""
         return _returns(self, trace)
+
+
+def jumped(ssh_map: SSHMap) -> tuple[int, ...]:
+    """The steps whose displacements a map disbelieves."""
+    return tuple(fault.step for fault in ssh_map.faults if fault.kind == "jumped")
 
 
 # The returns that were asked for last: several parts of a search ask for them, and as a trace grows they are those of fewer steps, and some more.

@@ -1,0 +1,61 @@
+"""ssh-abduction completion SHELL: what a shell needs to complete verbs, options and files."""
+
+from __future__ import annotations
+
+import argparse
+import re
+
+from ssh_abduction.cli.options import Verbs
+from ssh_abduction.errors import SSHError
+
+SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = "Print the completion of verbs, options and files for a shell. Needs the package shtab: pip install 'ssh-abduction[completion]'."
+    parser = verbs.add_parser("completion", help="print completions for a shell", description=text)
+    parser.add_argument("shell", choices=SHELLS, help="the shell that completes")
+    parser.set_defaults(run=run)
+    parser.epilog = (
+        'bash: eval "$(ssh-abduction completion bash)" in ~/.bashrc; zsh: write it to a file _ssh-abduction in a folder of $fpath; '
+        "fish: write it to ~/.config/fish/completions/ssh-abduction.fish"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    try:
+        import shtab
+    except ImportError:
+        raise SSHError("completion: expected the package shtab, got none; pip install 'ssh-abduction[completion]'") from None
+    if options.shell not in shtab.SUPPORTED_SHELLS:
+        raise SSHError(f"completion: expected a shtab that knows {options.shell}, got {shtab.__version__}; pip install -U shtab")
+    from ssh_abduction.cli import parser
+
+    top = parser()
+    for action in _all_actions(top):
+        if kind := _file_kind(action):
+            action.complete = shtab.FILE if kind == "file" else shtab.DIRECTORY  # type: ignore[attr-defined]
+    print(shtab.complete(top, options.shell))
+    return 0
+
+
+def _all_actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+    """The arguments of a parser and of all verbs below it."""
+    found = list(parser._actions)  # which argparse has no public name for
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for verb in action.choices.values():
+                found += _all_actions(verb)
+    return found
+
+
+def _file_kind(action: argparse.Action) -> str | None:
+    """Whether an argument is a file or a folder, by its metavar; a positional one that is no number and has no choices is a file."""
+    if action.nargs == 0 or action.choices is not None:
+        return None
+    if not action.option_strings:
+        return "file" if action.type is None else None
+    named = str(action.metavar or "")
+    if "FOLDER" in named:
+        return "folder"
+    return "file" if re.search(r"FILE|TRACE|MAPS|PNG|PAGE", named) else None

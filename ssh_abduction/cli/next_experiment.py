@@ -1,0 +1,132 @@
+"""ssh-abduction next TRACE MAPS: what should the robot do to tell these maps apart?"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+
+from ssh_abduction.asp.limits import Watch, check_limit
+from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.cli.outcome import interrupted_code, on_ctrl_c, warn
+from ssh_abduction.cli.text import table
+from ssh_abduction.errors import MapError, named, printable
+from ssh_abduction.files import json_line
+from ssh_abduction.maps import maps_of, read_json
+from ssh_abduction.rivals.consequences import Consequence
+from ssh_abduction.rivals.explore import Experiment, Plan, Untried, next_experiment, told_rivals
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Trace
+
+# So many columns of a table, and lines of a plan, are shown at most, as more cannot be taken in on a terminal; --json has all.
+SHOWN_COLUMNS, SHOWN_LINES = 6, 40
+# What the shell is told where a limit ended the search: a plan that may be better, or none at all.
+EXIT_CUT_SHORT, EXIT_NOTHING = 10, 30
+HOW = {"link": "known", "implied": "implied", "expected": "expected", "open": "open"}
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = (
+        "What to do next, to find out which of these maps is true: from where the robot is now, the fewest actions after which they predict something different; of many maps a plan. "
+        "Where the links that all maps know do not tell them apart, the untried action that tells most, and the way to it."
+    )
+    parser = verbs.add_parser("next", help="what should the robot do to tell these maps apart?", description=text)
+    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
+    parser.add_argument("maps", help="what solve --json printed for this trace, or one saved map; - for standard input")
+    parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds with the plan so far")
+    parser.add_argument("--memory-limit", type=int, metavar="MIB", help="stop when the process has used so much memory")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_theory(parser, default="the theory of the maps, or how the maps read stars")
+    parser.set_defaults(run=run)
+    parser.epilog = (
+        "The plan for two maps is the shortest one. That for more is greedy, as the best one is hard to find (PSPACE-complete: Lee & Yannakakis 1994). "
+        "Exit codes: 0 done; 10 a limit ended the search, and there may be a better plan; 30 no plan in time. docs/formats.md says what --json prints."
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    check_limit("--time-limit", "seconds", options.time_limit)
+    check_limit("--memory-limit", "MiB", options.memory_limit)
+    trace = Trace.load(options.trace)
+    data = read_json(options.maps)
+    maps = maps_of(data, str(options.maps))
+    if not maps:
+        raise MapError(f"{named(options.maps)}: maps: expected one to seek an experiment for, got none; see the status that solve printed")
+    found = data.get("theory") if isinstance(data, dict) else None
+    theory: Theory | None = theory_of(options, None if found is None else Theory.from_dict(found))
+    if found is None and options.theory is None and theory == Theory.topological():
+        theory = None  # a saved map does not say under which theory it was made
+    watch = Watch(options.time_limit, options.memory_limit)
+
+    def interrupt() -> None:
+        watch.interrupted = True
+
+    try:
+        with on_ctrl_c(interrupt):
+            experiment = next_experiment(
+                maps,
+                trace,
+                theory=theory,
+                complete=not (isinstance(data, dict) and data.get("complete") is False),
+                watch=watch,
+            )
+    except MapError as error:
+        raise MapError(f"{named(options.maps)}: {error}") from None
+    print(json_line(experiment.to_dict()) if options.json else "\n".join(_lines(experiment)))
+    if experiment.warning:
+        warn([experiment.warning])
+    if experiment.stopped == "interrupted":
+        return interrupted_code()
+    return 0 if not experiment.stopped else EXIT_CUT_SHORT if experiment.plan.branches else EXIT_NOTHING
+
+
+def _lines(experiment: Experiment) -> Iterator[str]:
+    """What is printed for people."""
+    yield experiment.sentence
+    plan = experiment.plan
+    if plan.branches:
+        shown = experiment.predictions[:SHOWN_COLUMNS]
+        more = len(experiment.predictions) - len(shown)
+        rows = [[action, *(said.seen[i] for said in shown)] for i, action in enumerate(plan.actions)]
+        yield table(["action", *(f"{told_rivals(said.rivals)} predict{'s' * (len(said.rivals) == 1)}" for said in shown)], rows)
+        if more:
+            yield f"  and {more} more predictions (--json has all)"
+        lines = list(_tree(plan, "  "))
+        if any(branch.plan.branches or branch.plan.untried for branch in plan.branches):
+            yield "the plan"
+            yield from lines[:SHOWN_LINES]
+            if len(lines) > SHOWN_LINES:
+                yield f"  and {len(lines) - SHOWN_LINES} more lines (--json has all)"
+    elif plan.untried and experiment.count > 1:
+        yield from _expected(plan.untried)
+
+
+def _tree(plan: Plan, indent: str) -> Iterator[str]:
+    """A plan as lines: the actions, and for each thing that may be seen then what is left, and how to go on."""
+    if plan.branches:
+        yield f"{indent}{printable(', '.join(plan.actions))}"
+    for branch in plan.branches:
+        rest = branch.plan
+        yield f"{indent}  {printable(str(branch.seen))}: {told_rivals(rest.rivals)}{_untried(rest)}"
+        yield from _tree(rest, f"{indent}    ")
+
+
+def _untried(plan: Plan) -> str:
+    """What may be tried where known links tell no more of several rivals."""
+    if len(plan.rivals) == 1 or plan.branches:
+        return ""
+    if plan.untried is None:
+        return "; nothing tells them apart"
+    return f"; known links tell no more, try {printable(', '.join((*plan.untried.way, plan.untried.action)))}"
+
+
+def _expected(untried: Untried) -> Iterator[str]:
+    """What rivals say of an untried action."""
+    shown = untried.expects[:SHOWN_LINES]
+    yield table(["maps", "leads to", "seen there", "which is"], [[told_rivals(said.rivals), *_says(said.says)] for said in shown])
+    if len(untried.expects) > len(shown):
+        yield f"  and {len(untried.expects) - len(shown)} more (--json has all)"
+
+
+def _says(says: Consequence) -> tuple[str, str, str]:
+    where = "not known" if says.dstate is None else f"dstate {says.dstate}"
+    return where, "not known" if says.seen is None else str(says.seen), HOW[says.how]

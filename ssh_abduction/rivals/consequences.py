@@ -1,0 +1,142 @@
+"""What a map says of an action: where it leads where it was tried, and what follows for it where it was not.
+
+An action that was never tried in a dstate may still have an end that the axioms, or the order of a path, tell:
+
+    a turn, where places have frames          to the slot that many quarters on (turn_rotates), whose dstate is known (one_dstate_per_heading), or whose star is that of the place, turned
+    a turn around, along a path               back along it (turn_around_reverses), where at most one dstate is (one_dstate_per_course)
+    a travel along a path                     to the next place in the order of the path. That is expected only: a map's order is one of several, and a place may be between that nobody saw
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+from ssh_abduction.maps import DState, SSHMap
+from ssh_abduction.rivals.machines import Seen
+from ssh_abduction.star import Star
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Action
+
+How: TypeAlias = Literal["link", "implied", "expected", "open"]
+_QUARTERS = {"right": 1, "around": 2, "left": 3}
+_OF_FRAMES = frozenset({"turn_rotates", "one_dstate_per_heading", "one_heading"})
+_OF_COURSES = frozenset({"turn_around_reverses", "one_dstate_per_course"})
+
+
+@dataclass(frozen=True, slots=True)
+class Consequence:
+    """What a map says of an action in a dstate.
+
+    how     link: it was tried; implied: the axioms tell; expected: the order of a path tells; open: nothing is known
+    dstate  where it leads, None where that is not known
+    seen    what is seen there, as far as it is known
+    """
+
+    how: How
+    dstate: int | None = None
+    seen: Seen | None = None
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the map is wrong if something else comes."""
+        return self.how in ("link", "implied")
+
+    def clashes(self, other: Consequence) -> bool:
+        """Whether the two maps cannot both be right about it, whatever comes."""
+        if not (self.is_sure and other.is_sure and self.seen and other.seen):
+            return False
+        one, two = self.seen, other.seen
+        views_differ = one.view is not None and two.view is not None and one.view != two.view
+        return views_differ or (one.star is not None and two.star is not None and one.star != two.star)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"how": self.how, "dstate": self.dstate} | (self.seen.to_dict() if self.seen else {"view": None})
+
+
+OPEN = Consequence("open")
+
+
+class Consequences:
+    """What one map says of actions.
+
+    links   for each dstate the actions that were tried there, and where they lead
+    looks   what each dstate looks like
+    theory  the axioms that tell; None for all
+    """
+
+    def __init__(self, ssh_map: SSHMap, links: dict[int, dict[str, int]], looks: Sequence[Seen], theory: Theory | None) -> None:
+        self._dstates, self._links, self._looks = ssh_map.dstates, links, looks
+        headed = [s for s in ssh_map.dstates if s.heading is not None and s.place is not None]
+        has_frames = all((s.heading or 0) < 4 for s in headed) if theory is None else theory.star == "frame" and theory.hard >= _OF_FRAMES
+        has_courses = theory is None or theory.hard >= _OF_COURSES
+        self._framed = {(s.place, s.heading): s.id for s in headed} if has_frames else {}
+        self._seen_at = {s.place: s for s in headed} if has_frames else {}  # a dstate at each place
+        self._at: dict[tuple[int | None, int | None, int | None], int] = {
+            (s.place, s.path, s.direction): s.id for s in ssh_map.dstates if s.path is not None and s.place is not None
+        }
+        self._turns_back = has_courses
+        self._orders = {path.id: path.order for path in ssh_map.paths}
+
+    def of(self, dstate: int, action: Action) -> Consequence:
+        """What the map says of an action in a dstate."""
+        there = self._links[dstate].get(action.name)
+        if there is not None:
+            return self._to(there, "link")
+        s = self._dstates[dstate]
+        if action.kind == "turn" and action.turn is not None:
+            return self._turned(s, action)
+        if action.kind == "travel" and s.path is not None:
+            return self._travelled(s)
+        return OPEN
+
+    def _turned(self, s: DState, action: Action) -> Consequence:
+        assert action.turn is not None
+        if s.place in self._seen_at and s.heading is not None and action.in_quarters:
+            slot = (s.heading + _QUARTERS[action.turn]) % 4
+            if (faced := self._framed.get((s.place, slot))) is not None:
+                return self._to(faced, "implied")
+            known = self._seen_at[s.place]
+            if not _is_four(self._looks[known.id]):
+                return OPEN
+            openings = self._looks[known.id].star or ()
+            turned = (slot - (known.heading or 0)) % 4
+            return Consequence("implied", None, Seen(None, openings[turned:] + openings[:turned]))
+        if action.turn == "around" and s.path is not None and self._turns_back:
+            back = self._at.get((s.place, s.path, -(s.direction or 0)))
+            if back is not None:
+                return self._to(back, "implied")
+        return OPEN
+
+    def _travelled(self, s: DState) -> Consequence:
+        order = self._orders.get(s.path or 0, ())
+        if s.place not in order:
+            return OPEN
+        next_one = order.index(s.place) + (s.direction or 0)
+        if not 0 <= next_one < len(order):
+            return OPEN
+        there = self._at.get((order[next_one], s.path, s.direction))
+        return OPEN if there is None else self._to(there, "expected")
+
+    def _to(self, dstate: int, how: How) -> Consequence:
+        return Consequence(how, dstate, self._looks[dstate])
+
+
+def _is_four(seen: Seen) -> bool:
+    """Whether a star is read as four openings."""
+    return seen.star is not None and len(seen.star) == 4 and all(isinstance(entry, bool) for entry in seen.star)
+
+
+def is_possible(action: Action, seen: Seen) -> bool:
+    """Whether an action can be done where this is seen, as far as the star tells: a travel goes through a gateway ahead, a turn to a gateway needs it."""
+    if seen.star is None:
+        return True
+    if _is_four(seen):
+        return action.kind != "travel" or bool(seen.star[0])
+    frames = Star.of(seen.star).frames
+    if action.kind == "travel":
+        return any(frame.faces(slot) for frame in frames for slot in range(frame.slots))
+    if action.gateway is not None:
+        return any(frame.nth(action.turn, action.gateway) is not None for frame in frames)
+    return True

@@ -1,0 +1,282 @@
+"""Maps as machines: what each predicts from the current dstate on, along the links that it knows.
+
+Maps whose machines are equal predict the same for ever, so they are merged: of 780 rivals that differ in paths alone one machine is left.
+
+A robot that follows links which all rivals know is, in each rival, at one dstate. These dstates together are a *joint state*: a row of numbers, one for each machine. From row to row
+numpy goes for all rows of one depth at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.errors import MapError, brief
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.star import Star
+from ssh_abduction.steps.log import observation
+from ssh_abduction.theory.evidence.alike import are_alike
+from ssh_abduction.theory.theory import IN_TOLERANCE, Theory
+from ssh_abduction.trace import Trace, View
+
+Array: TypeAlias = NDArray[np.int32]
+Row: TypeAlias = tuple[int, ...]
+UNKNOWN = -1  # stands for the end of a link that a machine does not have
+# So many numbers, at most, are in the rows that are worked on at once: some ten megabytes.
+CHUNK = 2**21
+
+
+class Limits(Protocol):
+    """What is asked now and then whether to go on; it raises where not."""
+
+    def check(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What is seen at a dstate: its view, None where it is not known; and its star as a trace writes it, None where stars say nothing."""
+
+    view: View | None
+    star: tuple[Any, ...] | None = None
+
+    def __str__(self) -> str:
+        view = "any view" if self.view is None else str(self.view)
+        return view if self.star is None else f"{view} {_star_text(self.star)}"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"view": self.view} | ({} if self.star is None else {"star": [_entry(entry) for entry in self.star]})
+
+
+def _entry(entry: Any) -> Any:
+    return entry.to_json() if hasattr(entry, "to_json") else int(entry) if isinstance(entry, bool) else entry
+
+
+def _star_text(star: Sequence[Any]) -> str:
+    if all(isinstance(entry, bool) for entry in star):
+        ways = [name for name, is_open in zip(("ahead", "right", "back", "left"), star, strict=True) if is_open]
+        return f"(open: {', '.join(ways) or 'nothing'})"
+    return f"({len(star)} gateways)"
+
+
+class Sights:
+    """What the dstates of rival maps look like. Two dstates have the same number exactly if nobody can tell them apart by one look.
+
+    Without a trace that is their views. Stars are read as the theory reads them: four openings; turned in any way, where it does not say how stars are turned; and where they agree in
+    tolerance only, stars that could be one, directly or by way of others, count as one, so that no difference is promised which might not be seen. Where no theory is given, stars are
+    read unless some map has a dstate with two stars.
+    """
+
+    def __init__(self, maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> None:
+        self._numbers: dict[object, int] = {}
+        self.seen: list[Seen] = []  # by number
+        reading = _reading(maps, trace, theory)
+        self.of = [
+            self._of(ssh_map, None if reading is None else trace, reading) for ssh_map in maps
+        ]  # for each map, the number of each dstate
+
+    def _of(self, ssh_map: SSHMap, trace: Trace | None, reading: _Reading | None) -> list[int]:
+        stars = _first_steps(ssh_map) if trace is not None and reading is not None else {}
+        return [self._number(s.view, stars.get(s.id), trace, reading) for s in ssh_map.dstates]
+
+    def _number(self, view: View, step: int | None, trace: Trace | None, reading: _Reading | None) -> int:
+        if step is None or trace is None or reading is None:
+            return self._add((view, None), Seen(view))
+        key, star = reading(step)
+        return self._add((view, key), Seen(view, star))
+
+    def _add(self, key: object, seen: Seen) -> int:
+        number = self._numbers.setdefault(key, len(self._numbers))
+        if number == len(self.seen):
+            self.seen.append(seen)
+        return number
+
+
+class _Reading:
+    """How the star of a step is read: what stands for all stars that are not told apart from it, and the star itself."""
+
+    def __init__(self, trace: Trace, theory: Theory, steps: Sequence[int] = ()) -> None:
+        self._trace, self._theory = trace, theory
+        self._classes = _classes(trace, steps) if theory.star in IN_TOLERANCE else {}
+
+    def __call__(self, step: int) -> tuple[object, tuple[Any, ...] | None]:
+        if self._theory.star in IN_TOLERANCE:
+            return self._classes[step], self._trace.steps[step].star
+        _, key = observation(self._trace.steps[step], self._theory)
+        return key, self._trace.steps[step].openings
+
+
+def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> _Reading | None:
+    """How stars are read; None where they say nothing."""
+    if trace is None or not trace.has_stars:
+        return None
+    if theory is not None:
+        settled = theory.resolve(trace)
+        if settled.star == "none":
+            return None
+        return _Reading(trace, settled, sorted({t for ssh_map in maps for t in _first_steps(ssh_map).values()}))
+    if trace.in_quarters:
+        reading = _Reading(trace, Theory(star="frame"))
+        looks = [reading(t)[0] for t in range(len(trace))]
+        is_read = all(len({(label, looks[t]) for t, label in _sound(m)}) == len({label for _, label in _sound(m)}) for m in maps)
+        return reading if is_read else None
+    stars = [step.gateways or Star(()) for step in trace.steps]
+    if any(not are_alike(stars[_first_steps(m)[label]], stars[t]) for m in maps for t, label in _sound(m)):
+        return None
+    return _Reading(trace, Theory(star="alike"), sorted({t for m in maps for t in _first_steps(m).values()}))
+
+
+def _sound(ssh_map: SSHMap) -> list[tuple[int, int]]:
+    """The steps of a map at which it believes what was seen, and the dstate of each."""
+    wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
+    return [(t, label) for t, label in enumerate(ssh_map.labels) if t not in wrong]
+
+
+def _first_steps(ssh_map: SSHMap) -> dict[int, int]:
+    """For each dstate, the first step at which it was seen as it is."""
+    first: dict[int, int] = {}
+    for t, label in _sound(ssh_map):
+        first.setdefault(label, t)
+    return first
+
+
+def _classes(trace: Trace, steps: Sequence[int]) -> dict[int, int]:
+    """For each of these steps a number. Steps with one view have the same number if their stars could be one, directly or by way of others."""
+    stars = {t: trace.steps[t].gateways or Star(()) for t in steps}
+    groups: dict[object, list[list[int]]] = {}  # for each view
+    for t in steps:
+        known = groups.setdefault(trace.steps[t].view, [])
+        near = [group for group in known if any(are_alike(stars[t], stars[other]) for other in group)]
+        joined = [other for group in near for other in group]
+        known[:] = [*(group for group in known if group not in near), [*joined, t]]
+    return {t: group[0] for known in groups.values() for group in known for t in group}
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """What a map predicts from the current dstate on.
+
+    sights  what is seen in each state, as a number of Sights; states are numbered by how they are reached, the current one is 0
+    ends    for each state, the state that each action leads to
+    """
+
+    sights: tuple[int, ...]
+    ends: tuple[tuple[tuple[str, int], ...], ...]
+
+
+def links_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
+    """For each dstate the actions that were tried there, in the order of their names, and where they lead. Raises MapError where an action leads to two dstates."""
+    found: dict[int, dict[str, int]] = {s.id: {} for s in ssh_map.dstates}
+    for source, action, target in sorted(ssh_map.links):
+        if found[source].setdefault(action, target) != target:
+            raise MapError(
+                f"maps[{number}]: links: expected one dstate that {brief(action)} leads to from dstate {source}, "
+                f"got {found[source][action]} and {target}; take a theory with the axiom deterministic"
+            )
+    return found
+
+
+def machine_of(start: int, links: Mapping[int, Mapping[str, int]], sights: Sequence[int]) -> tuple[Machine, tuple[int, ...]]:
+    """The machine of a map, and the dstate that each of its states is."""
+    number, reached = {start: 0}, [start]
+    ends: list[tuple[tuple[str, int], ...]] = []
+    for s in reached:
+        for target in links[s].values():
+            if target not in number:
+                number[target] = len(reached)
+                reached.append(target)
+        ends.append(tuple((action, number[target]) for action, target in links[s].items()))
+    return Machine(tuple(sights[s] for s in reached), tuple(ends)), tuple(reached)
+
+
+class Table:
+    """Machines as tables of numbers, for all of which an action is followed at once.
+
+    ends    (machines, states, actions): the state that an action leads to, or UNKNOWN
+    sights  (machines, states): what is seen there
+    """
+
+    def __init__(self, machines: Sequence[Machine], actions: Sequence[str]) -> None:
+        column = {action: i for i, action in enumerate(actions)}
+        most = max(len(machine.sights) for machine in machines)
+        self.ends: Array = np.full((len(machines), most, len(actions)), UNKNOWN, np.int32)
+        self.sights: Array = np.full((len(machines), most), UNKNOWN, np.int32)
+        for i, machine in enumerate(machines):
+            self.sights[i, : len(machine.sights)] = machine.sights
+            for s, ends in enumerate(machine.ends):
+                for action, target in ends:
+                    self.ends[i, s, column[action]] = target
+
+    def follow(self, group: Array, rows: Array, action: int) -> tuple[Array, Array]:
+        """Where an action leads from joint states, and what is seen there; UNKNOWN where a machine does not know it.
+
+        group  the machines, (m,);  rows  the joint states, (n, m)
+        """
+        there = self.ends[group, rows, action]
+        return there, np.where(there < 0, UNKNOWN, self.sights[group, there])
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """The joint states that as many actions lead to, and no fewer, without any difference being seen.
+
+    rows  (n, m);  first  the number of the first row, counted over all layers
+    """
+
+    depth: int
+    first: int
+    rows: Array
+
+
+class Walk:
+    """Follows links that all machines of a group know, as long as these see the same: breadth first, so by fewest actions.
+
+    >>> blind = Machine((0, 0), ((("a", 1),), (("a", 0),)))
+    >>> walk = Walk(Table([blind, blind], ["a"]), [0, 1], (0, 0), None)
+    >>> [layer.rows.tolist() for layer in walk.layers()], walk.way(1)
+    ([[[0, 0]], [[1, 1]]], [0])
+    """
+
+    def __init__(self, table: Table, group: Sequence[int], start: Row, limits: Limits | None) -> None:
+        self.table, self.group, self._limits = table, np.array(group, np.int32), limits
+        self._start = start
+        self._came: list[tuple[int, int]] = [(0, 0)]  # for each row the row before it, and the action
+
+    def layers(self) -> Iterator[Layer]:
+        """The joint states, the nearest first."""
+        known = {np.array(self._start, np.int32).tobytes()}
+        layer = Layer(0, 0, np.array([self._start], np.int32))
+        while len(layer.rows):
+            yield layer
+            rows: list[Array] = []
+            for numbers, action, there, seen in self.moves(layer):
+                alike = (there >= 0).all(axis=1) & (seen == seen[:, :1]).all(axis=1)
+                for i in np.flatnonzero(alike).tolist():
+                    key = there[i].tobytes()
+                    if key not in known:
+                        known.add(key)
+                        rows.append(there[i])
+                        self._came.append((numbers + i, action))
+            width = len(self.group)
+            layer = Layer(layer.depth + 1, layer.first + len(layer.rows), np.array(rows, np.int32).reshape(len(rows), width))
+
+    def moves(self, layer: Layer) -> Iterator[tuple[int, int, Array, Array]]:
+        """For parts of a layer and each action: the number of the part's first row, the action, where it leads, and what is seen there."""
+        size = max(CHUNK // len(self.group), 1)
+        for start in range(0, len(layer.rows), size):
+            part = layer.rows[start : start + size]
+            for action in range(self.table.ends.shape[2]):
+                if self._limits is not None:
+                    self._limits.check()
+                yield layer.first + start, action, *self.table.follow(self.group, part, action)
+
+    def way(self, row: int) -> list[int]:
+        """The actions that lead to a row."""
+        found: list[int] = []
+        while row:
+            row, action = self._came[row]
+            found.append(action)
+        return found[::-1]

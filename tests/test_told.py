@@ -1,0 +1,230 @@
+"""What commands tell beside their answers: the log, -q and -v, lines of progress, names that were perhaps meant, completions."""
+
+from __future__ import annotations
+
+import builtins
+import json
+import logging
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from worlds import TOURS, drive, rectangle
+
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.cli import main, parser, verbosity
+from ssh_abduction.cli.completion import SHELLS
+
+ACES = str(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
+VERBS = sorted(parser().verbs)
+MESSAGE = re.compile(r"ssh-abduction: \d+\.\d\d s: [\w.]+: .+")
+
+
+def lines(capsys: pytest.CaptureFixture[str], *words: str, code: int = 0) -> tuple[str, list[str]]:
+    """What a command prints, and its lines on stderr."""
+    assert main(words) == code
+    captured = capsys.readouterr()
+    return re.sub(r"\d+\.\d\d s", "_ s", captured.out), captured.err.splitlines()
+
+
+@pytest.fixture
+def noisy(tmp_path: Path) -> str:
+    circuits = rectangle(40)
+    trace = circuits.with_views([view if t != 33 else "v0" for t, view in enumerate(map(str, circuits.views))])
+    trace.save(tmp_path / "noisy.jsonl")
+    return str(tmp_path / "noisy.jsonl")
+
+
+def test_the_library_is_silent(capfd: pytest.CaptureFixture[str]) -> None:
+    assert any(isinstance(handler, logging.NullHandler) for handler in logging.getLogger("ssh_abduction").handlers)
+    solve(drive(*TOURS["comb"]))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_log_says_what_is_found_and_proven(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.DEBUG, "ssh_abduction"):
+        solution = solve(Trace.load(ACES))
+    told = [record.getMessage() for record in caplog.records]
+    assert {record.name.partition(".")[0] for record in caplog.records} == {"ssh_abduction"}
+    assert told[0].startswith("search of <Trace 'ACES3 route': 23 steps, 6 views, 4 actions; stars> under Theory(")
+    assert told[0].endswith(", with StepEngine")
+    assert "minimal maps cost 19 dstates, 10 places, 4 paths; they are listed" in told
+    assert "StepEngine is given 23 of 23 steps" in told
+    assert re.fullmatch(r"ended after \d+\.\d\d s: optimal, 4 maps", told[-1])
+    bounds = [int(found[1]) for text in told if (found := re.search(r"dstates ≥ (\d+)", text))]
+    assert bounds == sorted(bounds)
+    assert solution.cost is not None
+    assert bounds[-1] == solution.cost.dstates
+    at_debug = {record.getMessage() for record in caplog.records if record.levelno == logging.DEBUG}
+    assert "StepEngine is given 23 of 23 steps" in at_debug
+
+
+def test_the_log_names_the_engines_that_are_tried(caplog: pytest.LogCaptureFixture) -> None:
+    circuits = rectangle(40)
+    with caplog.at_level(logging.INFO, "ssh_abduction"):
+        for theory in (Theory.causal(), Theory.causal().replace(misread=1.5), Theory.topological()):
+            solve(circuits, theory)
+    engines = re.findall(r", with (\w+)", caplog.text)
+    assert engines == ["CausalEngine", "FaultyEngine", "StepEngine"]
+
+
+def test_verbose_tells_and_twice_tells_more(capsys: pytest.CaptureFixture[str]) -> None:
+    plain, none = lines(capsys, "solve", ACES)
+    some_out, some = lines(capsys, "solve", ACES, "-v")
+    before_out, before = lines(capsys, "-v", "solve", ACES)
+    more_out, more = lines(capsys, "solve", "-vv", ACES)
+    assert plain == some_out == before_out == more_out
+    assert none == []
+    assert min(len(some), len(before)) > 5
+    assert not any("prefixes: " in line for line in (*some, *before))
+    assert sum("prefixes: " in line for line in more) > 3
+    assert all(MESSAGE.fullmatch(line) for line in [*some, *before, *more])
+    assert logging.getLogger("ssh_abduction").level == logging.NOTSET
+    assert not [h for h in logging.getLogger("ssh_abduction").handlers if not isinstance(h, logging.NullHandler)]
+
+
+def test_quiet_leaves_errors_alone(noisy: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out, told = lines(capsys, "solve", noisy, "--theory", "causal", "--json")
+    assert len(told) == 1
+    assert "looks like noise" in told[0]
+    quiet, nothing = lines(capsys, "solve", noisy, "--theory", "causal", "--json", "-q")
+    assert nothing == []
+    assert json.loads(quiet)["warnings"] == json.loads(out)["warnings"]
+    assert lines(capsys, "-q", "solve", noisy, "--theory", "causal")[1] == []
+    _, wrong = lines(capsys, "-q", "solve", "no such file", code=1)
+    assert wrong == ["ssh-abduction: no such file: expected a readable trace file: No such file or directory; check the path"]
+
+
+def test_quiet_and_verbose_contradict_each_other(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["solve", "-q", "-v", ACES])
+    assert "not allowed with argument -q/--quiet" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_takes_them(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main([verb, "--help"])
+    out = capsys.readouterr().out
+    assert "-q, --quiet" in out
+    assert "-v, --verbose" in out
+
+
+def test_lines_of_progress_come_now_and_then(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    assert lines(capsys, "solve", ACES)[1] == []
+    monkeypatch.setattr(verbosity, "EVERY", 0.1)
+    some = lines(capsys, "solve", ACES, "--theory", "circumscriptive")[1]
+    monkeypatch.setattr(verbosity, "EVERY", 0.0)
+    for verb in ("solve", "ladder"):
+        _, told = lines(capsys, verb, ACES)
+        assert len(told) > len(some)
+        assert all(re.fullmatch(r"ssh-abduction: prefix \d+ of 23 steps; .*; \d+ maps; \d+\.\d s", line) for line in told)
+    assert lines(capsys, "solve", ACES, "-q")[1] == []
+    assert all(MESSAGE.fullmatch(line) for line in lines(capsys, "solve", ACES, "-v")[1])
+
+
+EAGER = "import sys; from ssh_abduction.cli import main, verbosity; verbosity.EVERY = 0.0; sys.exit(main(sys.argv[1:]))"
+
+
+@pytest.mark.parametrize(("words", "mixed"), [((), True), (("--json",), False)])
+def test_progress_never_comes_between_the_lines_of_an_answer_for_programs(words: tuple[str, ...], mixed: bool) -> None:
+    command = [sys.executable, "-c", EAGER, "solve", ACES, *words]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True)
+    assert ("ssh-abduction: prefix" in done.stdout) == mixed
+    if not mixed:
+        assert json.loads(done.stdout)["count"] == 4
+
+
+def test_a_view_cannot_steer_the_terminal_by_the_log(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    trace = Trace.from_steps(["\x1b[2J", "b"], ["travel"], name="\x1b[31m\nname")
+    trace.save(tmp_path / "trace.jsonl")
+    _, told = lines(capsys, "solve", str(tmp_path / "trace.jsonl"), "-vv")
+    assert told
+    assert all(line.isprintable() for line in told)
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("slove trace.jsonl", "solve"),
+        ("chek trace.jsonl maps.json", "check"),
+        ("recognize r x", "recognise"),
+        ("localise maps.json x", "localize"),
+        ("solve trace.jsonl --tme-limit 5", "--time-limit"),
+        ("solve trace.jsonl --tme-limit=5", "--time-limit"),
+        ("solve trace.jsonl --star gateway", "gateways"),
+        ("show maps.json --grapml", "--graphml"),
+        ("completion bsh", "bash"),
+    ],
+)
+def test_what_was_perhaps_meant_is_named(words: str, meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(words.split())
+    assert capsys.readouterr().err.endswith(f"; did you mean {meant}?\n")
+
+
+@pytest.mark.parametrize("words", ["frobnicate", "solve trace.jsonl --xyzzy", "solve a b --star \x1b[2J", "check a b c"])
+def test_what_is_near_nothing_is_no_question(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(words.split(" "))
+    err = capsys.readouterr().err
+    assert "did you mean" not in err
+    assert err.replace("\n", "").isprintable()
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_completions_know_every_verb_and_its_options(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out, _ = lines(capsys, "completion", shell)
+    for verb in VERBS:
+        assert verb in out
+    assert "time-limit" in out
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash")
+@pytest.mark.parametrize(
+    ("typed", "completed"),
+    [("sol", ["solve"]), ("solve --time", ["--time-limit"]), ("solve --star f", ["frame"]), ("solve exa", ["example.jsonl"])],
+)
+def test_bash_completes(typed: str, completed: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, _ = lines(capsys, "completion", "bash")
+    (tmp_path / "complete.bash").write_text(out)
+    (tmp_path / "example.jsonl").write_text("")
+    words = typed.split()
+    program = (
+        "source ./complete.bash; "
+        f"COMP_WORDS=(ssh-abduction {' '.join(words)}); COMP_CWORD={len(words)}; "
+        "$(complete -p ssh-abduction | sed 's/.*-F \\([^ ]*\\).*/\\1/'); printf '%s\\n' \"${COMPREPLY[@]}\""
+    )
+    done = subprocess.run(["bash", "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == completed
+
+
+def test_without_shtab_it_is_named(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    imported = builtins.__import__
+
+    def without(name: str, *rest: Any, **more: Any) -> Any:
+        if name == "shtab":
+            raise ImportError(name)
+        return imported(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    _, told = lines(capsys, "completion", "bash", code=1)
+    assert told == ["ssh-abduction: completion: expected the package shtab, got none; pip install 'ssh-abduction[completion]'"]
+
+
+def test_the_bootstrap_loop_tells_its_stages(caplog: pytest.LogCaptureFixture) -> None:
+    from simulator.tours import simulate
+    from simulator.world import World
+    from ssh_abduction.learner import BootstrapLearner
+
+    run = simulate(World.named("notched-rectangle"), tours=4, seed=1)
+    with caplog.at_level(logging.INFO, "ssh_abduction"):
+        learner = BootstrapLearner().fit(run)
+    told = [record.getMessage() for record in caplog.records if record.name == "ssh_abduction.learner"]
+    assert told == [f"{len(run)} images, 4 views", "a map of 8 dstates", f"a recogniser of {len(run)} images"]
+    assert np.all(learner.labels_ >= 0)

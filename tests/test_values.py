@@ -1,0 +1,362 @@
+"""Values as scripts and notebooks meet them: short reprs, sequences, files, errors that are ValueErrors."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from worlds import TOURS, drive, rectangle
+
+import ssh_abduction
+from simulator.errors import SimulatorError
+from simulator.world import World
+from ssh_abduction import (
+    Certificate,
+    Localiser,
+    MapError,
+    OnlineMapper,
+    RangeError,
+    Search,
+    Solution,
+    Speedups,
+    SSHError,
+    SSHMap,
+    Status,
+    Theory,
+    Trace,
+    TraceError,
+    evaluate,
+    maps,
+    solve,
+)
+from ssh_abduction.labels import LearnerError
+from ssh_abduction.solver.judging import InternalError
+
+ROOT = Path(__file__).parent.parent
+ACES = Trace.load(ROOT / "examples" / "aces3-route.jsonl")
+RECTANGLE = Trace.load(ROOT / "examples" / "notched-rectangle.jsonl")
+SOLUTION = solve(ACES)
+IMPOSSIBLE = Trace.from_steps("abcd", ["travel", "around", "around"])
+LONG = 120  # characters of a repr, at most
+
+
+def misread() -> tuple[Trace, Solution]:
+    trace = Trace.from_steps([f"v{t % 4}" if t != 9 else "v0" for t in range(25)], ["right", "travel"] * 12)
+    return trace, solve(trace, Theory.causal().replace(misread=1.5))
+
+
+def online() -> tuple[Trace, Solution]:
+    mapper = OnlineMapper("v0", Theory.causal())
+    for t in range(1, 10):
+        mapper.observe(("right", "travel")[(t - 1) % 2], f"v{t % 4}")
+    solution = mapper.observe("travel", "v2")
+    return mapper.trace, solution
+
+
+def in_metres() -> tuple[Trace, Solution]:
+    trace = Trace.from_steps("cwcwcwcwc", ["travel", "left"] * 4, displacements=[(10, 0, 0), (0, 0, 1.5708)] * 4)
+    return trace, solve(trace, Theory.causal())
+
+
+def noisy() -> Trace:
+    circuits = rectangle(40)
+    return circuits.with_views([view if t != 33 else "v0" for t, view in enumerate(map(str, circuits.views))])
+
+
+SOLVED: dict[str, Callable[[], tuple[Trace, Solution]]] = {
+    "several maps": lambda: (ACES, SOLUTION),
+    "one map": lambda: (RECTANGLE, solve(RECTANGLE)),
+    "cut off": lambda: (ACES, solve(ACES, maps=2)),
+    "levels": lambda: (ACES, solve(ACES, within=3, maps=0, prefer=("dstates", "places", "paths"))),
+    "levels cut off": lambda: (ACES, solve(ACES, within=3, maps=9, prefer=("dstates", "places", "paths"))),
+    "stars": lambda: ((trace := drive(*TOURS["comb"], stars=True)), solve(trace, Theory.circumscriptive())),
+    "poses": in_metres,
+    "faults": misread,
+    "online": online,
+    "no proof": lambda: (ACES, solve(ACES, limit=1e-4)),
+    "no map": lambda: (IMPOSSIBLE, solve(IMPOSSIBLE)),
+    "nothing yet": lambda: (IMPOSSIBLE, solve(IMPOSSIBLE, limit=1e-9)),
+    "noise": lambda: ((trace := noisy()), solve(trace, Theory.causal())),
+}
+
+
+def test_reprs_are_short() -> None:
+    """Before, that of this solution had 9,976 characters, and that of the trace of 400 steps 79,737."""
+    assert repr(SOLUTION) == "<Solution optimal: 19 dstates, 10 places, 4 paths; 4 minimal maps>"
+    assert repr(SOLUTION[0]) == "<SSHMap: 19 dstates, 10 places, 4 paths; 23 steps>"
+    assert repr(ACES) == "<Trace 'ACES3 route': 23 steps, 6 views, 4 actions; stars>"
+    assert repr(Trace.from_steps("ab", ["travel"])) == "<Trace: 2 steps, 2 views, 1 action>"
+    assert repr(SOLUTION.backbone) == (
+        "<Backbone: the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ>"
+    )
+    assert repr(SOLUTION.bound) == "Bound(dstates=19)"
+    assert repr(Theory.topological()) == "Theory()"
+    assert repr(Speedups.without("threads")) == "Speedups(threads=False)"
+    assert repr(RECTANGLE[0]) == "Step(view='v0', action='right')"
+    assert repr(solve(misread()[0], Theory.causal(), limit=1e-9)) == "<Solution feasible (time limit): 13 dstates; dstates ≥ 13>"
+
+
+@pytest.mark.parametrize("kind", SOLVED)
+def test_no_repr_is_long(kind: str) -> None:
+    trace, solution = SOLVED[kind]()
+    values = [trace, trace[0], solution, *solution, solution.backbone, solution.bound, solution.cost, solution.certificate]
+    values += [Search(trace, solution.theory), evaluate(solution.maps, ACES) if trace is ACES and len(solution) else None]
+    values += [solution.backbone.dstates] if solution.backbone else []
+    for value in values:
+        assert len(repr(value)) <= LONG, value
+        assert "\n" not in repr(value)
+
+
+def test_a_long_value_of_a_theory_and_an_image_are_cut() -> None:
+    pairs = [(t, t + 1) for t in range(1000)]
+    assert len(repr(Theory.causal().replace(same=pairs))) < 2 * LONG
+    assert repr(Trace.from_steps(["a" * 1000], [])) == "<Trace: 1 step, 1 view, 0 actions>"
+    assert len(repr(Certificate(tuple(range(1000))))) <= LONG
+
+
+def test_a_solution_is_a_sequence_of_its_maps() -> None:
+    assert len(SOLUTION) == SOLUTION.count == 4
+    assert list(SOLUTION) == [SOLUTION[i] for i in range(4)] == list(SOLUTION.maps)
+    assert SOLUTION[-1] == SOLUTION.maps[3]
+    assert SOLUTION[1:3] == SOLUTION.maps[1:3]
+    assert list(reversed(SOLUTION)) == list(SOLUTION.maps[::-1])  # type: ignore[call-overload]
+    assert SOLUTION[2] in SOLUTION
+    with pytest.raises(RangeError, match=r"^maps: expected 0 to 3, or -4 to -1 from the end, got 4$"):
+        SOLUTION[4]
+    none = solve(IMPOSSIBLE)
+    assert (len(none), list(none), bool(none)) == (0, [], True)
+    with pytest.raises(RangeError, match="there are none"):
+        none[0]
+
+
+def test_traces_are_sliced() -> None:
+    assert ACES[3] is ACES.steps[3]
+    assert ACES[-1] is ACES.steps[22]
+    assert ACES[:20] == ACES.prefix(20)
+    assert ACES[:] == ACES == ACES[-100:1000]
+    for start, stop in ((0, 5), (4, 9), (22, 23), (-5, None), (3, -2)):
+        part = ACES[start:stop]
+        assert part.views == ACES.views[start:stop]
+        assert part.actions == ACES.actions[slice(start, stop).indices(23)[0] : slice(start, stop).indices(23)[1] - 1]
+        assert part.name == ACES.name
+    assert solve(RECTANGLE[8:200]).cost == solve(RECTANGLE).cost
+
+
+def test_a_slice_of_a_trace_has_no_displacement_that_led_to_it() -> None:
+    trace = in_metres()[0]
+    part = trace[3:6]
+    assert [step.displacement for step in part] == [None, trace[4].displacement, trace[5].displacement]
+    assert [step.displacement for step in trace[:3]] == [step.displacement for step in trace.steps[:3]]
+
+
+@pytest.mark.parametrize("index", [23, -24, 10**30])
+def test_a_step_that_there_is_not_names_the_range(index: int) -> None:
+    with pytest.raises(RangeError, match=r"^steps: expected 0 to 22, or -23 to -1 from the end, got "):
+        ACES[index]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "said"),
+    [
+        (slice(5, 5), RangeError, "steps: expected a slice that holds some of 0 to 22, got 5:5"),
+        (slice(23, None), RangeError, "got 23:23"),
+        (slice(None, None, 2), TraceError, "steps: expected steps in a row"),
+        (slice(None, None, -1), TraceError, "steps: expected steps in a row"),
+        ("3", TypeError, "steps: expected a whole number or a slice, got '3'"),
+        (1.0, TypeError, "whole number"),
+        (True, TypeError, "whole number"),
+    ],
+)
+def test_a_slice_that_is_no_trace_is_an_error(wrong: Any, error: type[Exception], said: str) -> None:
+    with pytest.raises(error, match=said):
+        ACES[wrong]
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    assert ssh_abduction.__version__ == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert "__version__" in dir(ssh_abduction)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        lambda: Trace.from_steps([], []),
+        lambda: Trace.load("no such file"),
+        lambda: ACES[99],
+        lambda: solve(ACES, maps=-1),
+        lambda: solve(ACES, limit=float("nan")),
+        lambda: Theory.topological().replace(star="round"),
+        lambda: Speedups.without("magic"),
+        lambda: SSHMap.load("no such file"),
+        lambda: Solution.load("no such file"),
+        lambda: Localiser(SOLUTION[0], "recogniser"),
+        lambda: World.named("atlantis"),
+        lambda: SOLUTION[9],
+    ],
+)
+def test_bad_input_is_a_value_error(bad: Callable[[], object]) -> None:
+    with pytest.raises(ValueError, match="expected") as caught:
+        bad()
+    assert isinstance(caught.value, SSHError)
+
+
+def test_what_is_no_bad_input_is_no_value_error() -> None:
+    assert not issubclass(InternalError, ValueError)
+    assert not issubclass(SSHError, ValueError)
+    assert all(issubclass(error, ValueError) for error in (LearnerError, SimulatorError))
+
+
+@pytest.mark.parametrize("kind", SOLVED)
+def test_a_solution_survives_files(kind: str, tmp_path: Path) -> None:
+    trace, solution = SOLVED[kind]()
+    file = tmp_path / "maps.json"
+    solution.save(file)
+    data = json.loads(file.read_text())
+    for loaded in (Solution.load(file), Solution.load(file, trace), Solution.from_dict(data)):
+        assert loaded == solution
+        assert loaded.to_dict() == data == solution.to_dict()
+        assert (loaded.backbone, loaded.summary) == (solution.backbone, solution.summary)
+        assert (loaded.certificate, loaded.weights) == (solution.certificate, solution.weights)
+        assert (loaded.warnings, loaded.costs) == (solution.warnings, solution.costs)
+        assert [m.to_dict() for m in loaded] == [m.to_dict() for m in solution]
+        assert repr(loaded) == repr(solution)
+    assert pickle.loads(pickle.dumps(loaded)) == solution
+
+
+def test_what_the_shell_prints_is_what_is_saved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from ssh_abduction.cli import main
+
+    assert main(["solve", str(ROOT / "examples" / "aces3-route.jsonl"), "--json"]) == 0
+    printed = capsys.readouterr().out
+    SOLUTION.save(tmp_path / "saved.json")
+    saved = (tmp_path / "saved.json").read_text()
+    assert len(printed.splitlines()) == len(saved.splitlines())
+    data = [json.loads(text) for text in (printed, saved)]
+    for each in data:
+        each.pop("seconds")
+    assert data[0] == data[1]
+    (tmp_path / "printed.json").write_text(printed)
+    assert Solution.load(tmp_path / "printed.json", ACES) == SOLUTION
+    assert main(["check", str(ROOT / "examples" / "aces3-route.jsonl"), str(tmp_path / "saved.json"), "--bound"]) == 0
+    assert capsys.readouterr().out.startswith("4 of 4 maps satisfy")
+
+
+def test_why_there_is_no_map_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from ssh_abduction.cli import main
+
+    IMPOSSIBLE.save(tmp_path / "trace.jsonl")
+    assert main(["solve", str(tmp_path / "trace.jsonl"), "--json"]) == 20
+    (tmp_path / "maps.json").write_text(capsys.readouterr().out)
+    loaded = Solution.load(tmp_path / "maps.json")
+    assert loaded.status is Status.UNSATISFIABLE
+    assert "turn_around_reverses" in str(loaded.to_dict()["explanation"])
+
+
+SAVED = SOLUTION.to_dict()
+
+
+def changed(**fields: Any) -> dict[str, Any]:
+    return {name: value for name, value in {**SAVED, **fields}.items() if value is not Ellipsis}
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (changed(version=2), r"version: expected 1, got 2; read it with the ssh-abduction that wrote it"),
+        (changed(version=True), "version: expected 1"),
+        (changed(format="ssh-trace"), "format: expected \"ssh-solution\", got 'ssh-trace'"),
+        (changed(theory=...), "theory: expected what solve --json or Solution.save writes, got none"),
+        (changed(theory={"level": "astral"}), "theory: level: expected"),
+        (changed(status="great"), "status: expected one of optimal"),
+        (changed(status="unsatisfiable"), "status: expected optimal or feasible, as there is a map"),
+        (changed(complete="yes"), "complete: expected true or false"),
+        (changed(count=5), "count: expected 4, as so many maps are listed, got 5"),
+        (changed(steps=24), r"maps\[0\].labels: expected 24, one a step, got 23"),
+        (changed(steps="23"), "steps: expected an integer"),
+        (changed(cost={"dstates": 18, "places": 10, "paths": 4}), "cost: expected 19 dstates"),
+        (changed(bound={"dstates": 20}), "bound: expected at most 19 dstates"),
+        (changed(bound={"dstates": -1}), "bound: expected numbers"),
+        (changed(maps=[SAVED["maps"][0]] * 4), "maps: expected each map once"),
+        (changed(maps=[]), "count: expected 0"),
+        (changed(maps={}), "maps: expected a list"),
+        (changed(seconds={"total": "long"}), "seconds.total: expected a finite number"),
+        (changed(seconds=[]), "seconds: expected an object"),
+        (changed(grounding={"rules": -3, "atoms": 1}), "grounding.rules: expected a whole number"),
+        (changed(stopped="boredom"), "stopped: expected one of"),
+        (changed(evidence={"stars": 7}), "evidence.stars: expected an object"),
+        (changed(partial={}), "partial: dstates: expected"),
+        (changed(certificate={"clique": [0, 0], "refuted": []}), "certificate.clique: expected different steps from 0 to 22"),
+        (changed(certificate={"clique": [0, 23], "refuted": []}), "certificate.clique: expected different steps from 0 to 22"),
+        (changed(certificate={"clique": [0, 1], "refuted": [7]}), "certificate.refuted: expected the numbers of dstates from 2 on"),
+        (changed(backbone={"proven": 1}), "backbone.proven: expected true or false"),
+        (changed(backbone={"proven": True, "dstates": {"always": [0], "sometimes": []}}), "backbone.dstates.always: expected 23 numbers"),
+        (changed(warnings=[3]), r"warnings\[0\]: expected a sentence"),
+        (SAVED["maps"][0], "maps: expected a solution, got one map; take SSHMap.load"),
+        ({"trace": "x", "status": "error", "error": "x: no trace"}, "got the error that solve ended with: 'x: no trace'"),
+        ([], "expected an object"),
+        (None, "expected an object"),
+        ({}, "maps: expected what solve --json"),
+    ],
+)
+def test_nonsense_is_named(data: Any, said: str, tmp_path: Path) -> None:
+    file = tmp_path / "maps.json"
+    file.write_text(json.dumps(data))
+    with pytest.raises(MapError, match=said) as caught:
+        Solution.load(file)
+    assert str(caught.value).startswith(str(file))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("text", "said"), [("", "got an empty file"), ("  \n", "empty file"), ("{", "broken JSON"), ("\0", "broken JSON")])
+def test_what_is_no_json_is_named(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "maps.json").write_text(text)
+    with pytest.raises(MapError, match=said):
+        Solution.load(tmp_path / "maps.json")
+
+
+def test_a_huge_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    SOLUTION.save(tmp_path / "maps.json")
+    monkeypatch.setattr("ssh_abduction.maps.LARGEST", 2**20)
+    assert Solution.load(tmp_path / "maps.json") == SOLUTION
+    with pytest.raises(MapError, match="expected at most 1 MiB, got more"):
+        Solution.load("/dev/zero")
+
+
+def test_maps_of_another_trace_are_named(tmp_path: Path) -> None:
+    SOLUTION.save(tmp_path / "maps.json")
+    with pytest.raises(MapError, match=r"expected 400, one for each step of the trace, got 23; the maps are of another trace"):
+        Solution.load(tmp_path / "maps.json", RECTANGLE)
+    other = ACES.with_views(["hall", *ACES.views[1:]])  # type: ignore[list-item]
+    with pytest.raises(MapError, match=r"maps\[0\]: expected view 'hall' at step 0, as the trace has it, got 'open-ahead"):
+        Solution.load(tmp_path / "maps.json", other)
+    solve(IMPOSSIBLE).save(tmp_path / "none.json")
+    with pytest.raises(MapError, match="steps: expected those of a trace of 23 steps, got 4"):
+        Solution.load(tmp_path / "none.json", ACES)
+
+
+def test_single_maps_say_what_they_are(tmp_path: Path) -> None:
+    SOLUTION.save(tmp_path / "maps.json")
+    SOLUTION[0].save(tmp_path / "map.json")
+    assert SSHMap.load(tmp_path / "map.json") == SOLUTION[0]
+    with pytest.raises(MapError, match=r"expected one map, got a solution; take Solution.load"):
+        SSHMap.load(tmp_path / "maps.json")
+    data = json.loads((tmp_path / "map.json").read_text())
+    (tmp_path / "map.json").write_text(json.dumps(data | {"version": 7}))
+    with pytest.raises(MapError, match="version: expected 1, got 7"):
+        SSHMap.load(tmp_path / "map.json")
+    assert maps.maps_of({k: v for k, v in data.items() if k not in ("format", "version")}, "old") == [SOLUTION[0]]
+
+
+def test_a_solution_without_the_maps_that_were_found_is_not_written(tmp_path: Path) -> None:
+    search = Search(ACES)
+    first = next(kept := iter(search))
+    assert len(list(kept)) == 3
+    for some in ((), (first,)):
+        with pytest.raises(MapError, match="maps: expected the 4 that the search gave"):
+            search.solution(some).save(tmp_path / "maps.json")
+    assert not list(tmp_path.iterdir())
