@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from html import escape
 from typing import TypeAlias
 
-from ssh_abduction.maps import xml_text
+from ssh_abduction.errors import xml_text
 
 Point: TypeAlias = tuple[float, float]
 
@@ -15,6 +15,8 @@ MARGIN, RADIUS = 80.0, 17.0
 # The colours of the paths, in turn. The first six are of the palette of Okabe & Ito, which people who are colour-blind can tell apart.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b")
 
+ALARM = "#b00020"  # what is disbelieved
+
 
 def text(x: float, y: float, label: str, colour: str, size: float = 12, weight: str = "normal", halo: bool = False) -> str:
     """A label with its middle at a point."""
@@ -22,6 +24,15 @@ def text(x: float, y: float, label: str, colour: str, size: float = 12, weight: 
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" font-weight="{weight}" fill="{colour}"{edge} '
         f'text-anchor="middle" dominant-baseline="central">{escaped(label)}</text>'
+    )
+
+
+def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
+    """The mark of what a map disbelieves: a red diamond with an exclamation mark, and what it is under the pointer."""
+    u = 8 * size
+    return (
+        f'<g class="fault"><title>{escaped(title)}</title><path d="M{x:.1f},{y - u:.1f} l{u:.1f},{u:.1f} l{-u:.1f},{u:.1f} l{-u:.1f},{-u:.1f} Z" fill="{ALARM}" '
+        f'stroke="white" stroke-width="1.5"/>{text(x, y, "!", "white", size=11 * size, weight="bold")}</g>'
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import numbers
+import re
 from typing import TypeGuard
 
 
@@ -60,6 +61,11 @@ def brief(value: object, width: int = 60) -> str:
 def printable(text: str) -> str:
     """A text on one line, in which characters that would steer a terminal, or that nobody sees, are escaped."""
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def xml_text(text: str) -> str:
+    """A text without the characters that XML cannot hold, or that would steer a terminal, each replaced by U+FFFD."""
+    return re.sub("[^\t\n -~\u00a0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
 
 
 def checked_index(index: object, count: int, what: str) -> int:

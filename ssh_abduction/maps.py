@@ -10,22 +10,26 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
-import re
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
 from ssh_abduction import cards
-from ssh_abduction.errors import MapError, brief, is_finite, is_writable, named, printable
+from ssh_abduction.errors import MapError, brief, is_finite, is_whole, is_writable, named, printable, xml_text
 from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
 from ssh_abduction.trace import Trace, View
 from ssh_abduction.words import counted
 
 if TYPE_CHECKING:
     import networkx as nx
+    import pandas as pd
+
+    from ssh_abduction.layout import Turns
 
 # What files of solutions and of single maps begin with.
 SOLUTION_FORMAT, MAP_FORMAT, VERSION = "ssh-solution", "ssh-map", 1
@@ -302,11 +306,65 @@ class SSHMap:
         (ssh_map,) = maps_of(data, named(path))
         return ssh_map
 
-    def to_networkx(self, level: Literal["causal", "topological"] = "causal") -> nx.Graph[Any]:
+    def place_of(self, step: int) -> int | None:
+        """The place that the robot was at in a step; None where the map has no places. Raises MapError where the trace has no such step."""
+        if not is_whole(step) or not 0 <= step < len(self.labels):
+            raise MapError(f"step: expected 0 to {len(self.labels) - 1}, got {brief(step)}; name a step of the trace that was mapped")
+        return self.dstates[self.labels[step]].place
+
+    def to_svg(self, turns: Trace | Turns | None = None) -> str:
+        """The map as SVG text: in metres where it has poses, else with straight paths and turns to their side.
+
+        turns  which way actions turn: the trace that was mapped, or for each name "right", "left", "around" or degrees clockwise. Actions of these names need none
+        """
+        from ssh_abduction.picture import svg
+
+        return svg(self, turns)
+
+    def plot(self, ax: Any = None, turns: Trace | Turns | None = None) -> Any:
+        """Draw the map with matplotlib, into these axes or into new ones, and return the axes. Raises MapError where matplotlib is not installed."""
+        from ssh_abduction.plotting import plot
+
+        return plot(self, ax, turns)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """A table with a row for each step: dstate, view, place, path, direction, heading; where there are poses also x, y (metres) and pose_heading (radians).
+
+        Raises MapError where pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ImportError:
+            raise MapError("to_pandas: expected pandas, got none; install it with pip install pandas") from None
+        rows = []
+        for s in (self.dstates[label] for label in self.labels):
+            row: dict[str, Any] = {
+                "dstate": s.id,
+                "view": s.view,
+                "place": s.place,
+                "path": s.path,
+                "direction": s.direction,
+                "heading": s.heading,
+            }
+            if self.fit and self.fit.poses:
+                pose = self.fit.poses[s.id]
+                row |= {"x": pose.x, "y": pose.y, "pose_heading": pose.heading}
+            rows.append(row)
+        table = pd.DataFrame(rows, index=pd.RangeIndex(len(rows), name="step"))
+        whole = ["place", "path", "direction", "heading"]
+        return table.astype(dict.fromkeys(whole, "Int64"))  # which knows missing numbers
+
+    def to_networkx(
+        self, level: Literal["causal", "topological", "places"] = "causal", turns: Trace | Turns | None = None
+    ) -> nx.Graph[Any]:
         """The map as a graph of networkx.
 
         causal       a MultiDiGraph: each dstate is a node (with view, place, path, direction), each link an edge (with action)
         topological  a Graph: its nodes are ("place", p) and ("path", h), and it has an edge where a place is on a path (with its index in the order)
+        places       a MultiGraph: each place is a node (with pos, x to the right and y up, and its dstates), and it has an edge for each two neighbours on a path
+                     (keyed by the path, with path, order: the index of the first of the two, travelled: whether the robot went from one to the other, and metres,
+                     where there are poses); graph["metric"] says whether positions are metres or a layout
+        turns        for the layout of places, as in `to_svg`
         """
         import networkx as nx
 
@@ -318,8 +376,10 @@ class SSHMap:
             for source, action, target in self.links:
                 causal.add_edge(source, target, key=action, action=action)
             return causal
+        if level == "places":
+            return self._graph_of_places(turns)
         if level != "topological":
-            raise MapError(f'level: expected "causal" or "topological", got {brief(level)}')
+            raise MapError(f'level: expected "causal", "topological" or "places", got {brief(level)}')
         bipartite: nx.Graph[Any] = nx.Graph()
         bipartite.add_nodes_from((("place", p) for p in self.places), bipartite=0)
         bipartite.add_nodes_from((("path", p.id) for p in self.paths), bipartite=1)
@@ -327,6 +387,22 @@ class SSHMap:
             for index, place in enumerate(path.order):
                 bipartite.add_edge(("place", place), ("path", path.id), index=index)
         return bipartite
+
+    def _graph_of_places(self, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
+        import networkx as nx
+
+        from ssh_abduction.layout import layout, travelled
+
+        found = layout(self, turns)
+        graph: nx.MultiGraph[Any] = nx.MultiGraph(metric=found.metric)
+        for place in self.places:
+            graph.add_node(place, pos=found.places[place], dstates=tuple(s.id for s in self.dstates if s.place == place))
+        for path in self.paths:
+            streets = travelled(self, path)
+            for index, (p, q) in enumerate(pairwise(path.order)):
+                metres = {"metres": math.dist(found.places[p], found.places[q])} if found.metric else {}
+                graph.add_edge(p, q, key=path.id, path=path.id, order=index, travelled=(min(p, q), max(p, q)) in streets, **metres)
+        return graph
 
     def to_graphml(self) -> str:
         """The causal graph as GraphML text."""
@@ -385,11 +461,6 @@ def write_map(path: str | os.PathLike[str], text: str, what: str = "map", option
 def _numbered(ids: Iterable[int | None]) -> dict[int | None, int]:
     """The ids with the numbers 0, 1, 2, … in the order in which they come."""
     return {number: i for i, number in enumerate(dict.fromkeys(x for x in ids if x is not None))}
-
-
-def xml_text(text: str) -> str:
-    """A text without the characters that XML cannot hold, or that would steer a terminal, each replaced by U+FFFD."""
-    return re.sub("[^\t\n -~\u00a0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:

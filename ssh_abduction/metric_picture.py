@@ -11,9 +11,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
+from typing import TYPE_CHECKING
 
-from ssh_abduction.drawing import COLOURS, Point, escaped, page, text
-from ssh_abduction.maps import DState, Path, Pose, SSHMap
+from ssh_abduction.drawing import COLOURS, Point, escaped, fault_mark, page, text
+from ssh_abduction.layout import travelled
+
+if TYPE_CHECKING:
+    from ssh_abduction.maps import DState, Pose, SSHMap
 
 # In units of the page: the two nearest places are drawn this far apart, unless the other limits forbid it; places are at most so far from their nearest, as a rule;
 # and the whole map is at most so large.
@@ -24,26 +28,9 @@ MARGIN = 24.0
 SMALLEST = 0.6  # where places are near each other all marks are smaller, down to this share
 WIDEST = LARGEST / 4  # half axes of ellipses that are longer are not drawn: the page would hold little else
 DEVIATIONS = 2.0  # the half axes of ellipses, in standard deviations
-FARTHEST = 1e7  # metres: positions farther away are not those of a robot
 TURNS = (
     0.1  # dstates of a causal map that are nearer than this share of its longest link are drawn as if the robot only turned between them
 )
-
-
-def located(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
-    """The poses of the dstates, if the map can be drawn by them.
-
-    It cannot where displacements are missing between parts of the map: each part has poses of its own then, seen from its own first dstate.
-    """
-    poses = ssh_map.fit.poses if ssh_map.fit else ()
-    if not poses or any(abs(number) > FARTHEST for pose in poses for number in (pose.x, pose.y, *pose.spread)):
-        return None
-    if set(ssh_map.places) - {s.place for s in ssh_map.dstates}:
-        return None
-    here = ssh_map.dstates[ssh_map.labels[0]]
-    first = Pose(0.0, 0.0, 0.0)
-    parts = [s for s in ssh_map.dstates if s.id != here.id and (s.place is None or s.place != here.place) and poses[s.id] == first]
-    return None if parts else poses
 
 
 def metric_svg(ssh_map: SSHMap, poses: Sequence[Pose]) -> str:
@@ -83,7 +70,7 @@ class _Picture:
         first = _site(self.map.dstates[self.map.labels[0]])
         dots = [self.dot(*at[site], site) for site in sorted(at, key=lambda site: site == first)]
         labels = self.place_labels(at) + self.dstate_labels() + (self.path_labels(at) if self.map.places else self.link_labels())
-        return page([*lines, *ellipses, *arrows, *dots, *labels, *self.scale_bar()], self.points, MARGIN)
+        return page([*lines, *ellipses, *arrows, *dots, *labels, *self.faults(), *self.scale_bar()], self.points, MARGIN)
 
     def on_page(self, pose: Pose) -> Point:
         return pose.x * self.scale, -pose.y * self.scale
@@ -130,6 +117,13 @@ class _Picture:
             f'transform="translate({pose.x * self.scale:.1f},{-pose.y * self.scale:.1f}) rotate({-math.degrees(pose.heading):.1f})"/></g>'
         )
 
+    def faults(self) -> list[str]:
+        """What the map disbelieves, at the ends of the arrows of the dstates where it does."""
+        faults: dict[int, list[str]] = {}
+        for fault in self.map.faults:
+            faults.setdefault(self.map.labels[fault.step], []).append(str(fault))
+        return [fault_mark(*self.along(self.map.dstates[s], END), "; ".join(said), self.unit) for s, said in faults.items()]
+
     def along(self, s: DState, far: float, aside: float = 0.0) -> Point:
         """A point so far ahead of a dstate, and so far to its left."""
         pose, u = self.poses[s.id], self.unit
@@ -144,23 +138,17 @@ class _Picture:
         """
         orders, travels = [], []
         for path in self.map.paths:
-            colour, u, travelled = COLOURS[path.id % len(COLOURS)], self.unit, self.travelled(path)
+            colour, u, streets = COLOURS[path.id % len(COLOURS)], self.unit, travelled(self.map, path)
             for p, q in pairwise(path.order):
-                if (min(p, q), max(p, q)) not in travelled:
+                if (min(p, q), max(p, q)) not in streets:
                     orders.append(
                         f'<path d="{_line(at[p], at[q])}" stroke="{colour}" stroke-width="{2 * u:.1f}" stroke-dasharray="2 5" opacity="0.7"/>'
                     )
-            for p, q in travelled:
+            for p, q in streets:
                 travels.append(
                     f'<path d="{_line(at[p], at[q])}" stroke="{colour}" stroke-width="{8 * u:.1f}" stroke-linecap="round" opacity="0.4"/>'
                 )
         return orders + travels
-
-    def travelled(self, path: Path) -> list[tuple[int, int]]:
-        """The pairs of places on a path between which the robot travelled."""
-        ends = [(self.map.dstates[s], self.map.dstates[x]) for s, _, x in self.map.links]
-        pairs = {(a.place, b.place) for a, b in ends if a.path == b.path == path.id}
-        return sorted({(min(p, q), max(p, q)) for p, q in pairs if p is not None and q is not None and p != q})
 
     def curves(self) -> list[tuple[Point, Point, Point, str]]:
         """The links of a causal map: where each begins, bends and ends, and the actions."""
@@ -243,7 +231,7 @@ class _Picture:
     def path_labels(self, at: Mapping[int, Point]) -> list[str]:
         marks = []
         for path in self.map.paths:
-            stretches = sorted(((at[p], at[q]) for p, q in self.travelled(path)), key=lambda ends: -math.dist(*ends))
+            stretches = sorted(((at[p], at[q]) for p, q in travelled(self.map, path)), key=lambda ends: -math.dist(*ends))
             spots = []
             for (ax, ay), (bx, by) in stretches:
                 far = math.dist((ax, ay), (bx, by)) or 1.0

@@ -16,11 +16,10 @@ from perception.features import TellingFeatures
 from perception.recognition import LearningCurve
 from simulator.laser import BEARINGS
 from simulator.world import World
-from ssh_abduction.drawing import COLOURS
 from ssh_abduction.errors import SSHError
 from ssh_abduction.files import write_file
 from ssh_abduction.maps import SSHMap
-from ssh_abduction.picture import SPACING, layout
+from ssh_abduction.plotting import plot
 from ssh_abduction.reproduce.claims import Outcome
 
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"
@@ -192,25 +191,9 @@ def draw_telling(
 
 
 def draw_map(path: str | Path, ssh_map: SSHMap) -> None:
-    """Places, and paths as streets through them. The layout is one of many: a map has no metres."""
-    at = layout(ssh_map)
-    xs, ys = zip(*at.values(), strict=True)
-    width, height = (max(v) - min(v) + 1.5 * SPACING for v in (xs, ys))
-    pyplot = _pyplot()
-    figure, axes = pyplot.subplots(figsize=(width / SPACING * 0.9, height / SPACING * 0.9))
-    for street in ssh_map.paths:
-        points = np.array([at[p] for p in street.order])
-        colour = COLOURS[street.id % len(COLOURS)]
-        axes.plot(points[:, 0], points[:, 1], color=colour, linewidth=6, alpha=0.55, solid_capstyle="round")
-        if len(points) > 1:
-            axes.annotate("", (points[0] + points[1]) / 2, points[0], arrowprops={"arrowstyle": "-|>", "color": colour})
-    for place, (x, y) in at.items():
-        here = ", ".join(f"x{s.id}" for s in ssh_map.dstates if s.place == place)
-        axes.plot(x, y, "o", color="white", markeredgecolor="black", markersize=20)
-        axes.text(x, y, str(place), ha="center", va="center", fontweight="bold")
-        axes.text(x + 0.22 * SPACING, y - 0.16 * SPACING, here, fontsize=6, ha="left", va="bottom")
-    axes.set(aspect="equal", xlim=(min(xs) - 0.5 * SPACING, max(xs) + SPACING), ylim=(max(ys) + 0.5 * SPACING, min(ys) - 0.5 * SPACING))
-    axes.axis("off")
+    """Places, and paths as streets through them, where its dstates are or, without poses, in one layout of many."""
+    _pyplot()
+    figure = plot(ssh_map).figure
     _save(figure, path)
 
 
