@@ -20,7 +20,6 @@ from perception.confidence import warn_of_doubts
 from perception.recognition import recogniser
 from perception.views import ISOLATED, ViewClusterer, as_view_clusterer
 from ssh_abduction.labels import AmbiguousMapWarning, LearnerError, labels_of, labels_of_all, labels_on, map_of
-from ssh_abduction.logs import log_of
 from ssh_abduction.runner_up import RunnerUpWarning, warn_of_second_map
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -28,8 +27,6 @@ from ssh_abduction.trace import Trace
 from ssh_abduction.traces import Traces
 
 __all__ = ["AmbiguousMapWarning", "BootstrapLearner", "LearnerError", "RunnerUpWarning", "labels_of"]
-
-_log = log_of(__name__)
 
 
 class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
@@ -63,15 +60,12 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         """Run the loop on a trace, or on several. Raises LearnerError, PerceptionError, TraceError."""
         traces, theory = Traces.of(X), checked_theory(self.theory)
         seen = self._look(traces, ISOLATED if theory.misread else None)
-        _log.info("%d images, %d views", len(traces.images), self.clusterer_.k_)
         self.solution_ = solve(seen.each[seen.longest], theory, limit=self.limit)
         self.map_, mapped = map_of(self.solution_, self.choose)
-        _log.info("a map of %d dstates", len(self.map_.dstates))
         self.second_map_ = warn_of_second_map(seen.each[seen.longest], self.solution_.maps, theory, self.limit)
         self.labels_ = labels_of_all(self.map_, mapped, seen, self.views_, self.features_)
         sure = self.labels_ >= 0
         sure[traces.at_longest([fault.step for fault in self.map_.faults if fault.kind == "misread"])] = False
-        _log.info("a recogniser of %d images", int(sure.sum()))
         self.recogniser_ = recogniser(features=self.features_).fit(traces.images[sure], self.labels_[sure])
         return self
 

@@ -27,6 +27,7 @@ from ssh_abduction.solver import prefixes
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.result import summary_of
 from ssh_abduction.solver.sharing import Backbone, Shared
+from ssh_abduction.words import counted
 
 ACES3 = "examples/aces3-route.jsonl"
 LIMIT = 10  # seconds: a search that does not end is a failure, not a hang
@@ -182,9 +183,8 @@ def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end()
     assert solution.backbone is not None
     assert solution.backbone.proven
     found = "the dstates of steps 4–14 differ; the places of steps 4–14 differ; the paths of steps 0 and 3–14 differ"
-    assert (
-        summary_of(solution, count, solution.backbone) == f"at least {count} minimal maps (listing was stopped by the time limit): {found}"
-    )
+    listed = f"at least {counted(count, 'minimal maps')} (listing was stopped by the time limit)"
+    assert summary_of(solution, count, solution.backbone) == f"{listed}: {found}"
 
 
 def test_what_is_known_goes_to_other_processes_and_what_asks_clingo_does_not() -> None:

@@ -21,7 +21,7 @@ from ssh_abduction import Search, Status, Theory, Trace, solve
 from ssh_abduction.asp.control import Control
 from ssh_abduction.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.cli import workers
-from ssh_abduction.explain import Interrupted, _Axioms
+from ssh_abduction.explain import Axioms, Interrupted, Piece
 from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.steps import certificate
@@ -210,7 +210,7 @@ def test_an_explanation_can_be_stopped_while_it_grounds() -> None:
     trace = rectangle(40)
     asked = iter([False, False, True])
     with pytest.raises(Interrupted):
-        _Axioms(trace, Theory.topological().resolve(trace), lambda: next(asked), 0, len(trace))
+        Axioms(Piece.of(trace, Theory.topological().resolve(trace), range(len(trace))), lambda: next(asked))
 
 
 def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:

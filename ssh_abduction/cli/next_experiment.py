@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 from ssh_abduction.asp.limits import Watch, check_limit
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
@@ -12,10 +13,12 @@ from ssh_abduction.cli.text import table
 from ssh_abduction.errors import MapError, named, printable
 from ssh_abduction.files import json_line
 from ssh_abduction.maps import maps_of, read_json
-from ssh_abduction.rivals.consequences import Consequence
-from ssh_abduction.rivals.explore import Experiment, Plan, Untried, next_experiment, told_rivals
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
+
+if TYPE_CHECKING:
+    from ssh_abduction.rivals.consequences import Consequence
+    from ssh_abduction.rivals.explore import Experiment, Plan, Untried
 
 # So many columns of a table, and lines of a plan, are shown at most, as more cannot be taken in on a terminal; --json has all.
 SHOWN_COLUMNS, SHOWN_LINES = 6, 40
@@ -44,6 +47,8 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    from ssh_abduction.rivals.explore import next_experiment  # loads numpy
+
     check_limit("--time-limit", "seconds", options.time_limit)
     check_limit("--memory-limit", "MiB", options.memory_limit)
     trace = Trace.load(options.trace)
@@ -87,7 +92,7 @@ def _lines(experiment: Experiment) -> Iterator[str]:
         shown = experiment.predictions[:SHOWN_COLUMNS]
         more = len(experiment.predictions) - len(shown)
         rows = [[action, *(said.seen[i] for said in shown)] for i, action in enumerate(plan.actions)]
-        yield table(["action", *(f"{told_rivals(said.rivals)} predict{'s' * (len(said.rivals) == 1)}" for said in shown)], rows)
+        yield table(["action", *(f"{_told_rivals(said.rivals)} predict{'s' * (len(said.rivals) == 1)}" for said in shown)], rows)
         if more:
             yield f"  and {more} more predictions (--json has all)"
         lines = list(_tree(plan, "  "))
@@ -106,7 +111,7 @@ def _tree(plan: Plan, indent: str) -> Iterator[str]:
         yield f"{indent}{printable(', '.join(plan.actions))}"
     for branch in plan.branches:
         rest = branch.plan
-        yield f"{indent}  {printable(str(branch.seen))}: {told_rivals(rest.rivals)}{_untried(rest)}"
+        yield f"{indent}  {printable(str(branch.seen))}: {_told_rivals(rest.rivals)}{_untried(rest)}"
         yield from _tree(rest, f"{indent}    ")
 
 
@@ -122,7 +127,7 @@ def _untried(plan: Plan) -> str:
 def _expected(untried: Untried) -> Iterator[str]:
     """What rivals say of an untried action."""
     shown = untried.expects[:SHOWN_LINES]
-    yield table(["maps", "leads to", "seen there", "which is"], [[told_rivals(said.rivals), *_says(said.says)] for said in shown])
+    yield table(["maps", "leads to", "seen there", "which is"], [[_told_rivals(said.rivals), *_says(said.says)] for said in shown])
     if len(untried.expects) > len(shown):
         yield f"  and {len(untried.expects) - len(shown)} more (--json has all)"
 
@@ -130,3 +135,9 @@ def _expected(untried: Untried) -> Iterator[str]:
 def _says(says: Consequence) -> tuple[str, str, str]:
     where = "not known" if says.dstate is None else f"dstate {says.dstate}"
     return where, "not known" if says.seen is None else str(says.seen), HOW[says.how]
+
+
+def _told_rivals(rivals: Sequence[int]) -> str:
+    from ssh_abduction.rivals.explore import told_rivals  # loads numpy
+
+    return told_rivals(rivals)
