@@ -20,6 +20,7 @@ from perception.confidence import warn_of_doubts
 from perception.recognition import recogniser
 from perception.views import ISOLATED, ViewClusterer, as_view_clusterer
 from ssh_abduction.labels import AmbiguousMapWarning, LearnerError, labels_of, labels_of_all, labels_on, map_of
+from ssh_abduction.logs import log_of
 from ssh_abduction.runner_up import RunnerUpWarning, warn_of_second_map
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -37,8 +38,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
                and with `isolated=10` where the theory allows views that are misread: images that are like no others then have no view, and disbelieving them costs little
     choose     the index of the map to take where several remain; None takes the labels on which all of them agree
     limit      seconds for finding the map
-    features   makes of images what is clustered and compared: a transformer of scikit-learn's kind. It is cloned. None for reciprocals of ranges, and for a PanoramaTransformer where
-               the header of a trace says that its images are panoramas
+    features   makes of images what is clustered and compared: a transformer of scikit-learn's kind, cloned. None for reciprocals of ranges, and for a PanoramaTransformer of panoramas
 
     After `fit` there are features_, clusterer_, views_ and confidence_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree or an image has no view,
     recogniser_, which has not learnt from images that the map says are misread, and second_map_, the map of the runner-up, where another number of views is about as good and gives another map.
@@ -62,10 +62,12 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         seen = self._look(traces, ISOLATED if theory.misread else None)
         self.solution_ = solve(seen.each[seen.longest], theory, limit=self.limit)
         self.map_, mapped = map_of(self.solution_, self.choose)
+        log_of(__name__).info("a map of %d dstates", len(self.map_.dstates))
         self.second_map_ = warn_of_second_map(seen.each[seen.longest], self.solution_.maps, theory, self.limit)
         self.labels_ = labels_of_all(self.map_, mapped, seen, self.views_, self.features_)
         sure = self.labels_ >= 0
         sure[traces.at_longest([fault.step for fault in self.map_.faults if fault.kind == "misread"])] = False
+        log_of(__name__).info("a recogniser of %d images", sure.sum())
         self.recogniser_ = recogniser(features=self.features_).fit(traces.images[sure], self.labels_[sure])
         return self
 
@@ -78,8 +80,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     def score(self, X: Trace | Sequence[Trace] | ArrayLike, y: ArrayLike | None = None) -> float:
         """The share of images that are recognised: as the dstates `y` (m,), or, where these are not given, as those on the way of each trace on the map.
 
-        Of the ways that no view contradicts it is the one that fits most images. Steps at which it does not tell the dstate do not count. Raises LearnerError
-        where there is none at which it does.
+        Of the ways that no view contradicts it is the one that fits most images. Steps whose dstate it does not tell do not count; LearnerError where there are no others.
         """
         found = self.predict(X)
         if y is None and not Traces.are(X):
@@ -98,6 +99,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         images = self.features_.transform(traces.images)
         self.clusterer_ = as_view_clusterer(usual if self.clusterer is None else clone(self.clusterer)).fit(images)
         self.views_, self.confidence_ = self.clusterer_.labels_, self.clusterer_.confidence_
+        log_of(__name__).info("%d images, %d views", len(traces.images), self.clusterer_.k_)
         warn_of_doubts(self.views_, self.confidence_, self.clusterer_.quality_[self.clusterer_.k_])
         return traces.with_views(images, self.views_, self.clusterer_.runner_up_labels_, self.confidence_)
 
