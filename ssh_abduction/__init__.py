@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.difference import Difference, difference
     from ssh_abduction.rivals.explore import Experiment, next_experiment
     from ssh_abduction.rivals.listing import Listing
+    from ssh_abduction.routes import Move, Route, route
     from ssh_abduction.rungs import Rung, ladder
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
@@ -44,6 +45,7 @@ _HOMES = {  # module: the names that it exports
     "rivals.difference": ("Difference", "difference"),
     "rivals.listing": ("Listing",),
     "rivals.explore": ("Experiment", "next_experiment"),
+    "routes": ("Move", "Route", "route"),
     "rungs": ("Rung", "ladder"),
     "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
@@ -74,12 +76,14 @@ __all__ = [
     "LocaliserError",
     "MapError",
     "MapEvaluation",
+    "Move",
     "Odometry",
     "OnlineMapper",
     "Path",
     "Pose",
     "Progress",
     "RangeError",
+    "Route",
     "Rung",
     "SSHError",
     "SSHMap",
@@ -98,6 +102,7 @@ __all__ = [
     "evaluate",
     "ladder",
     "next_experiment",
+    "route",
     "solve",
 ]
 

@@ -227,6 +227,7 @@ class SSHMap:
                 for p in sorted(self.paths, key=lambda p: path[p.id])
             ),
             excused=tuple((path.get(h, h), path.get(g, g)) for h, g in self.excused),
+            fit=self.fit and replace(self.fit, poses=tuple(self.fit.poses[s.id] for s in visited) if self.fit.poses else ()),
             faults=self.faults,
         )
 

@@ -1,0 +1,65 @@
+"""ssh-abduction route MAPS --from A --to B: the actions that lead there, and the views to expect on the way."""
+
+from __future__ import annotations
+
+import argparse
+
+from ssh_abduction.cli.options import Verbs
+from ssh_abduction.cli.text import course, table
+from ssh_abduction.errors import MapError, printable
+from ssh_abduction.files import json_line
+
+
+def add_parser(verbs: Verbs) -> None:
+    text = "The shortest route through a map: the actions from one dstate or place to another, and the views to expect on the way."
+    parser = verbs.add_parser("route", help="which actions lead there?", description=text)
+    parser.add_argument("maps", help="what solve --json printed, or one saved map; - for standard input")
+    parser.add_argument(
+        "--from", dest="start", metavar="A", help="a dstate by its number, or a place as p3 (default: where the robot was at its last step)"
+    )
+    parser.add_argument("--to", dest="goal", metavar="B", required=True, help="a dstate by its number, or a place as p3: any dstate there")
+    parser.add_argument("--avoid", nargs="+", action="extend", metavar="X", help="dstates, and places as p3, that the route may not touch")
+    by = "what the route has the fewest of: actions or metres, through links that were driven before, or places, along the paths of the map, driven that way or not (default: actions)"
+    parser.add_argument("--by", choices=("actions", "places", "metres"), default="actions", help=by)
+    parser.add_argument("--map", default="1", metavar="I", help="which map, by its number, from 1, or its id (default: the first)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=run)
+    parser.epilog = "ssh-abduction show lists the dstates and places of a map. docs/formats.md says what the JSON has."
+
+
+def run(options: argparse.Namespace) -> int:
+    from ssh_abduction.rivals.listing import Listing
+    from ssh_abduction.routes import route, told_action  # which loads networkx
+
+    listing = Listing.load(options.maps)
+    try:
+        found = route(listing, options.start, options.goal, by=options.by, avoid=_names(options.avoid), map=options.map)
+    except MapError as error:
+        if str(error).startswith(f"{listing.source}:"):
+            raise
+        raise MapError(f"{listing.source}: {error}") from None
+    if options.json:
+        print(json_line(found.to_dict()))
+        return 0
+    print(printable(found.sentence))
+    if found.moves:
+        rows = [
+            [
+                told_action(move),
+                "" if move.dstate is None else move.dstate,
+                "not known" if move.view is None else move.view,
+                "" if move.place is None else move.place,
+                course(move.path, move.direction),
+                *([] if move.metres is None else [f"{move.metres:.2f}"]),
+                "" if move.known else "never tried",
+            ]
+            for move in found.moves
+        ]
+        metres = [] if found.metres is None else ["metres"]
+        print(table(["action", "dstate", "expect", "place", "path", *metres, ""], rows))
+    return 0
+
+
+def _names(words: list[str] | None) -> list[str]:
+    """What is avoided: several words, each perhaps of several names with commas between them."""
+    return [name for word in words or () for name in word.split(",") if name]

@@ -1,0 +1,148 @@
+"""Routes are the shortest ones, lead where they say, and errors name the range."""
+
+from __future__ import annotations
+
+import json
+import random
+from itertools import product
+
+import pytest
+from worlds import rectangle
+
+from ssh_abduction import MapError, SSHMap, Theory, Trace, route, solve
+from ssh_abduction.cli import main
+from ssh_abduction.maps import DState, Fit, Path, Pose
+
+
+@pytest.fixture(scope="module")
+def square() -> SSHMap:
+    """Four places around a square of ten metres, driven round once; then the robot turned around."""
+    moves = [(10, 0, 0), (0, 0, 1.5708)] * 4
+    trace = Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=moves)
+    return solve(trace).maps[0]
+
+
+def random_map(seed: int) -> SSHMap:
+    """Links between six dstates by chance, with poses."""
+    chance = random.Random(seed)
+    links = {(s, action, chance.randrange(6)) for s in range(6) for action in "xy" if chance.random() < 0.6}
+    poses = tuple(Pose(chance.uniform(1, 9), chance.uniform(1, 9), 0.0, (0.1, 0.0, 0.1)) for _ in range(6))
+    dstates = tuple(DState(i, f"v{i}") for i in range(6))
+    return SSHMap(tuple(range(6)), dstates, tuple(sorted(links)), fit=Fit(0.0, 1, 1.0, poses=poses)).renumbered()
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("by", ["actions", "metres"])
+def test_no_sequence_of_actions_is_shorter(seed: int, by: str) -> None:
+    ssh_map = random_map(seed)
+    leads = {(s, action): x for s, action, x in ssh_map.links}
+    poses = ssh_map.fit.poses if ssh_map.fit else ()
+    shortest: dict[int, float] = {}
+    for actions in (way for n in range(6) for way in product("xy", repeat=n)):
+        here, cost = 0, 0.0
+        for action in actions:
+            there = leads.get((here, action))
+            if there is None:
+                break
+            cost += 1 if by == "actions" else abs(complex(poses[here].x - poses[there].x, poses[here].y - poses[there].y))
+            here = there
+        else:
+            shortest[here] = min(cost, shortest.get(here, cost))
+    for goal in range(6):
+        if goal not in shortest:
+            with pytest.raises(MapError, match="that known links lead to"):
+                route(ssh_map, 0, goal, by=by)
+            continue
+        found = route(ssh_map, 0, goal, by=by)
+        assert found.dstates[-1] == goal
+        assert found.views == tuple(ssh_map.dstates[s or 0].view for s in found.dstates)
+        assert found.is_known
+        assert found.metres is not None
+        assert (len(found.moves) if by == "actions" else found.metres) == pytest.approx(shortest[goal])
+
+
+def test_a_route_by_places_leads_back_along_a_street_that_was_driven_one_way(square: SSHMap) -> None:
+    by_links = route(square, 0, "p3")
+    by_places = route(square, 0, "p3", by="places")
+    assert (len(by_links.moves), by_links.is_known) == (5, True)
+    assert (by_places.moves[-1].place, by_places.is_known) == (3, False)
+    assert [move.place for move in by_places.moves] == [0, 3]
+    assert by_places.moves[0].action is None
+    assert (by_places.moves[1].action, by_places.moves[1].view) == ("travel", None)
+    assert by_places.metres == pytest.approx(10, abs=0.1)
+
+
+def test_what_is_avoided_is_gone_round() -> None:
+    dstates = tuple(DState(i, "v", i) for i in range(4))
+    links = ((0, "a", 1), (1, "a", 3), (0, "b", 2), (2, "b", 0), (2, "c", 2), (2, "a", 1))
+    ssh_map = SSHMap((0, 1, 2, 3), dstates, links, (0, 1, 2, 3), (Path(0, (0, 1)),))
+    assert route(ssh_map, 0, 1).dstates == (0, 1)
+    assert route(ssh_map, 0, 1).goal == "dstate 1"
+    assert route(ssh_map, 0, 3).dstates == (0, 1, 3)
+    with pytest.raises(MapError, match="avoid: expected a way round what is avoided, got none to dstate 3; avoid less"):
+        route(ssh_map, 0, 3, avoid=[1])
+    with pytest.raises(MapError, match="those of to"):
+        route(ssh_map, 0, 3, avoid=["p3"])
+    detour = SSHMap(ssh_map.labels, dstates, (*links, (2, "d", 3)), (0, 1, 2, 3), (Path(0, (0, 1)),))
+    assert route(detour, 0, 3, avoid=["p1"]).actions == ("b", "d")
+
+
+def test_rivals_agree_where_their_links_lead_to_the_same_views() -> None:
+    corridor = Trace.from_steps(
+        ["end", "hall", "hall", "end", "end", "hall", "hall"], ["travel", "travel", "travel", "around", "travel", "around"]
+    )
+    solution = solve(corridor)
+    assert solution.count > 1
+    found = route(solution, 0, 3)
+    assert (found.agree, found.maps) == (tuple(range(1, solution.count + 1)), solution.count)
+    assert f"{solution.count} of {solution.count} maps" in found.sentence
+    # After the step from which the next experiment tells the rivals apart, only the map itself and those like it expect what it expects.
+    odd = [
+        route(solution, None, goal, map=m + 1)
+        for m in range(solution.count)
+        for goal in {x for s, _, x in solution.maps[m].links if s == solution.maps[m].labels[-1]}
+    ]
+    assert any(len(way.agree) < solution.count for way in odd)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"start": 99, "goal": 1}, "from: expected a dstate, 0 to 7, or a place as p0, got 99"),
+        ({"start": 0, "goal": "p9"}, "to: expected p0 to p3, got 'p9'"),
+        ({"start": 0, "goal": True}, "to: expected a dstate"),
+        ({"start": 0, "goal": 1, "avoid": ["x"]}, r"avoid\[0\]: expected a dstate"),
+        ({"start": 0, "goal": 1, "by": "hours"}, "by: expected actions, places or metres"),
+        ({"start": 0, "goal": 1, "map": 7}, "expected the number of a map, 1 to 1"),
+        ({"start": 0, "goal": 1, "by": "metres"}, "by: expected actions or places, got metres: the map has no poses"),
+    ],
+)
+def test_errors_name_the_range(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(MapError, match=message):
+        route(solve(rectangle(8)).maps[0], **arguments)  # type: ignore[arg-type]
+
+
+def test_maps_without_paths_have_no_routes_by_places() -> None:
+    with pytest.raises(MapError, match="the map has no paths"):
+        route(solve(rectangle(8), Theory.causal()).maps[0], 0, 1, by="places")
+
+
+def test_a_map_numbered_anew_keeps_its_poses(square: SSHMap) -> None:
+    assert square.renumbered().fit == square.fit
+    turned = SSHMap((1, 0), (DState(0, "a"), DState(1, "b")), (), fit=Fit(0.0, 1, 1.0, poses=(Pose(1.0, 2.0, 3.0), Pose(0.0, 0.0, 0.0))))
+    found = turned.renumbered().fit
+    assert found is not None
+    assert found.poses == (Pose(0.0, 0.0, 0.0), Pose(1.0, 2.0, 3.0))
+
+
+def test_the_command_prints_what_python_finds(square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]) -> None:
+    file = f"{tmp_path}/map.json"
+    square.save(file)
+    assert main(["route", file, "--from", "0", "--to", "p2", "--by", "metres", "--json"]) == 0
+    printed = capsys.readouterr().out
+    assert json.loads(printed) == json.loads(json.dumps(route(square, 0, "p2", by="metres").to_dict()))
+    assert main(["route", file, "--to", "p1", "--by", "places", "--avoid", "p2,p3"]) == 0
+    told = capsys.readouterr().out
+    assert "never tried" not in told or "implied" in told
+    assert main(["route", file, "--to", "44"]) == 1
+    assert "0 to" in capsys.readouterr().err
