@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from ssh_abduction.engines.base import Cost
     from ssh_abduction.errors import LocaliserError, MapError, RangeError, SolverError, SSHError, TheoryError, TraceError
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
+    from ssh_abduction.export.formats import export_map
     from ssh_abduction.localize import Belief, Chances, Localiser
     from ssh_abduction.maps import DState, Fit, Path, Pose, SSHMap
     from ssh_abduction.odometry import Odometry
@@ -37,6 +38,7 @@ _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
     "errors": ("LocaliserError", "MapError", "RangeError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
+    "export.formats": ("export_map",),
     "localize": ("Belief", "Chances", "Localiser"),
     "maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
     "odometry": ("Odometry",),
@@ -100,6 +102,7 @@ __all__ = [
     "compare",
     "difference",
     "evaluate",
+    "export_map",
     "ladder",
     "next_experiment",
     "route",

@@ -1,0 +1,8 @@
+"""Maps for other programs: a module a format, and the table of them."""
+
+from __future__ import annotations
+
+from ssh_abduction.export.formats import FORMATS, export_map
+from ssh_abduction.export.roads import Road, Roads, Stop
+
+__all__ = ["FORMATS", "Road", "Roads", "Stop", "export_map"]

@@ -1,0 +1,85 @@
+"""The formats that maps are exported to, and what writes each.
+
+>>> from ssh_abduction import Trace, solve
+>>> corridor = Trace.from_steps(["end", "hall", "end"], ["travel", "travel"], displacements=[(5, 0, 0), (5, 0, 0)])
+>>> text = export_map(solve(corridor).maps[0], "nav2")
+>>> text[:28], text.count('"Point"')
+('{"type": "FeatureCollection"', 3)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import networkx as nx
+
+from ssh_abduction.errors import MapError, brief, is_writable
+from ssh_abduction.export.nav2 import nav2
+from ssh_abduction.export.roads import Roads
+from ssh_abduction.export.tmap2 import tmap2
+from ssh_abduction.files import json_line
+from ssh_abduction.layout import Turns, located
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.trace import Trace
+
+FORMATS = ("nav2", "tmap2", "graphml", "dot", "networkx-json")
+FOR_NAVIGATION = ("nav2", "tmap2")  # which need positions
+LEVELS = ("places", "dstates")
+
+
+def export_map(
+    ssh_map: SSHMap,
+    to: str,
+    *,
+    level: str | None = None,
+    name: str = "ssh-abduction",
+    frame: str = "map",
+    turns: Trace | Turns | None = None,
+) -> str:
+    """A map as the text of a file for another program.
+
+    to     nav2: a route graph of Nav2 (GeoJSON); tmap2: a topological map of LCAS's topological_navigation (YAML); graphml; dot: Graphviz; networkx-json: what
+           networkx.node_link_graph reads
+    level  what nodes are, "places" or "dstates"; None for places in what robots navigate by, where the map has any, and dstates elsewhere
+    name   of the map, for tmap2 of its pointset, too
+    frame  the coordinate frame of the positions
+    turns  which way actions turn, for the layout of a map without poses, as `SSHMap.to_svg` takes them
+
+    Positions are metres where the map has poses, seen from the first dstate; else they are of a layout, and the file says so. Raises MapError for what no such file can hold.
+    """
+    if to not in FORMATS:
+        raise MapError(f"to: expected {', '.join(FORMATS[:-1])} or {FORMATS[-1]}, got {brief(to)}; take one of these")
+    if level is None:
+        level = "places" if to in FOR_NAVIGATION and ssh_map.places else "dstates"
+    if level not in LEVELS:
+        raise MapError(f"level: expected places or dstates, got {brief(level)}; say what nodes are")
+    for field, text in (("name", name), ("frame", frame)):
+        if not isinstance(text, str) or not text or not is_writable(text):
+            raise MapError(f"{field}: expected a text, got {brief(text)}; name it")
+    if to in FOR_NAVIGATION:
+        return (nav2 if to == "nav2" else tmap2)(Roads.of(ssh_map, level, turns), name, frame)
+    if level == "places":
+        if not ssh_map.places:
+            raise MapError("level: expected dstates, got places: the map has no places; export its dstates")
+        if to == "dot":
+            raise MapError("level: expected dstates, got places: DOT has a node a dstate, and a cluster a place; leave the level out")
+        graph = _graph_of_places(ssh_map, turns)
+    elif to == "networkx-json":
+        graph = ssh_map.to_networkx()
+    else:
+        return ssh_map.to_dot() if to == "dot" else ssh_map.to_graphml()
+    return json_line(nx.node_link_data(graph, edges="edges")) if to == "networkx-json" else "\n".join(nx.generate_graphml(graph))
+
+
+def _graph_of_places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.Graph[Any]:
+    """The graph of places with plain attributes alone, as files hold them."""
+    graph = ssh_map.to_networkx("places", turns)
+    for _, data in graph.nodes(data=True):
+        data["x"], data["y"] = (round(float(number), 4) for number in data.pop("pos"))
+        data["dstates"] = " ".join(map(str, data["dstates"]))
+    return graph
+
+
+def is_metric(ssh_map: SSHMap) -> bool:
+    """Whether the positions of an exported map are metres, and not of a layout."""
+    return located(ssh_map) is not None

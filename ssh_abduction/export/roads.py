@@ -1,0 +1,113 @@
+"""What navigation programs want of a map: stops with positions, and directed roads between them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ssh_abduction.errors import MapError
+from ssh_abduction.layout import Turns, layout, travelled
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.trace import Trace, View
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Where a robot can be sent.
+
+    id        the number of the place or of the dstate
+    x, y      metres, or units of the layout
+    heading   radians counterclockwise from x; of a place that of its first dstate, 0 where none is known
+    views     what is seen there, in the order of the dstates
+    """
+
+    id: int
+    x: float
+    y: float
+    heading: float
+    views: tuple[View, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Road:
+    """A directed edge between two stops.
+
+    length     in a straight line, in metres or units of the layout; of a turn on the spot 0
+    action     what the robot did there; None where it only drove the other way
+    path, direction  along which path, and which way; None where it is along none
+    """
+
+    start: int
+    end: int
+    length: float
+    action: str | None
+    path: int | None
+    direction: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Roads:
+    """A map as stops and directed roads.
+
+    level   what stops are: places or dstates
+    metric  whether positions are metres, of displacements; elsewhere they are of a layout
+    """
+
+    level: str
+    metric: bool
+    stops: tuple[Stop, ...]
+    roads: tuple[Road, ...]
+
+    @classmethod
+    def of(cls, ssh_map: SSHMap, level: str, turns: Trace | Turns | None = None) -> Roads:
+        """The stops and roads of a map. Raises MapError where there are none.
+
+        level  places: a place a stop, and a road each way along each street that was travelled, as a path leads both ways; dstates: a link a road
+        """
+        drawn = layout(ssh_map, turns)
+        if level == "places":
+            if not ssh_map.places:
+                raise MapError("level: expected dstates, got places: the map has no places; export its dstates")
+            members = {p: [s for s in ssh_map.dstates if s.place == p] for p in ssh_map.places}
+            stops = tuple(
+                Stop(
+                    p, *drawn.places[p], next((h for s in ds if (h := drawn.dstates[s.id][2]) is not None), 0.0), tuple(s.view for s in ds)
+                )
+                for p, ds in members.items()
+            )
+            ends = _streets(ssh_map)
+        else:
+            stops = tuple(
+                Stop(s.id, x, y, heading or 0.0, (s.view,)) for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
+            )
+            ends = {
+                (s, x): (action, here.path if here.path == there.path else None, here.direction if here.path == there.path else None)
+                for s, action, x in sorted(ssh_map.links, reverse=True)
+                if s != x
+                for here, there in [(ssh_map.dstates[s], ssh_map.dstates[x])]
+            }
+        at = {stop.id: (stop.x, stop.y) for stop in stops}
+        roads = tuple(Road(a, b, math.dist(at[a], at[b]), *what) for (a, b), what in sorted(ends.items()))
+        if not roads:
+            raise MapError(f"map: expected roads between its {level}, got none; log a trace that moves on")
+        return cls(level, drawn.metric, stops, roads)
+
+
+def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], tuple[str | None, int | None, int | None]]:
+    """From one place to another: the action that was done there, or None, and along which path that is, and which way."""
+    ends: dict[tuple[int, int], tuple[str | None, int | None, int | None]] = {}
+    for path in ssh_map.paths:
+        index = {place: i for i, place in enumerate(path.order)}
+        for p, q in travelled(ssh_map, path):
+            way = 1 if index.get(p, 0) < index.get(q, 0) else -1
+            ends.setdefault((p, q), (None, path.id, way))
+            ends.setdefault((q, p), (None, path.id, -way))
+    for s, action, x in sorted(ssh_map.links, reverse=True):
+        here, there = ssh_map.dstates[s], ssh_map.dstates[x]
+        if here.place is not None and there.place is not None and here.place != there.place:
+            ends[here.place, there.place] = (
+                action,
+                here.path if here.path == there.path else None,
+                here.direction if here.path == there.path else None,
+            )
+    return ends
