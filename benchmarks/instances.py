@@ -40,6 +40,29 @@ def displaced(trace: Trace, poses: Sequence[Pose], odometry: Odometry, seed: int
     return replace(trace, steps=tuple(steps), odometry=odometry)
 
 
+Cell = tuple[int, int]
+
+
+def doors_of(width: int, height: int, chance: random.Random, loops: float = 0.1) -> set[tuple[Cell, Cell]]:
+    """The corridors of a maze, from cell to cell, each in both directions: a random spanning tree of the grid, and each further wall open by chance."""
+    walls = [((x, y), (x + dx, y + dy)) for x in range(width) for y in range(height) for dx, dy in ((1, 0), (0, 1))]
+    walls = [(a, b) for a, b in walls if b[0] < width and b[1] < height]
+    chance.shuffle(walls)
+    root = {(x, y): (x, y) for x in range(width) for y in range(height)}
+
+    def found(cell: Cell) -> Cell:
+        while root[cell] != cell:
+            cell = root[cell]
+        return cell
+
+    doors: set[tuple[Cell, Cell]] = set()
+    for a, b in walls:
+        if found(a) != found(b) or chance.random() < loops:
+            root[found(a)] = found(b)
+            doors |= {(a, b), (b, a)}
+    return doors
+
+
 def maze(
     width: int,
     height: int,
@@ -65,21 +88,7 @@ def maze(
     scale, bend  errors of the odometry that repeat, as a share and in radians a metre
     """
     chance = random.Random(seed)
-    walls = [((x, y), (x + dx, y + dy)) for x in range(width) for y in range(height) for dx, dy in ((1, 0), (0, 1))]
-    walls = [(a, b) for a, b in walls if b[0] < width and b[1] < height]
-    chance.shuffle(walls)
-    root = {(x, y): (x, y) for x in range(width) for y in range(height)}
-
-    def found(cell: tuple[int, int]) -> tuple[int, int]:
-        while root[cell] != cell:
-            cell = root[cell]
-        return cell
-
-    doors: set[tuple[tuple[int, int], tuple[int, int]]] = set()
-    for a, b in walls:
-        if found(a) != found(b) or chance.random() < loops:
-            root[found(a)] = found(b)
-            doors |= {(a, b), (b, a)}
+    doors = doors_of(width, height, chance, loops)
 
     def ahead(x: int, y: int, heading: int) -> tuple[int, int]:
         return x + HEADINGS[heading % 4][0], y + HEADINGS[heading % 4][1]

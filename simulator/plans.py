@@ -233,12 +233,45 @@ def tour(
         if moved is not None and odometry is not None:
             moved = reported(moved, odometry, drawn, scale=scale, bend=bend)
         bearings = _bearings(plan, stand)
-        rough = sorted({round(bearing / COARSE) * COARSE % 360 for bearing in bearings})
         star = _sighted(plan, stand, apart / 4, sighted)
-        view = f"{len(bearings)} door{'s' * (len(bearings) > 1)}: {' '.join(map(str, rough))}"
-        logged.append(Step(view, action, star, moved, truth=_truth(plan, stand, pose)))
+        logged.append(Step(_view(bearings), action, star, moved, truth=_truth(plan, stand, pose)))
         before = pose
     return Trace(tuple(logged), name=f"{plan.name}, {steps} steps, seed {seed}", odometry=odometry)
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A plan as a world of its own that a robot can be driven in, action by action: where it may stand, what it sees there, and what it can do.
+
+    >>> from simulator.plans import Door, Floor, Plan, Room
+    >>> floor = Floor(Plan("two", (Room("a", "", (0, 0)), Room("b", "", (0, 9))), (Door((0, 1), (0, 5)),)))
+    >>> floor.sight(floor.start).view, [action.name for action in floor.ends(floor.start)]
+    ('1 door: 0', ['travel'])
+
+    plan    whose doors are told apart already, as by Plan.told_apart
+    spread  degrees that the bearings in a star may be off, as the star says; they are exact
+    """
+
+    plan: Plan
+    spread: float = APART / 4
+
+    @property
+    def start(self) -> Stand:
+        """At the first gateway of the first room from which the most others can be reached."""
+        return Stand(self.plan.connected[0], 0)
+
+    def sight(self, stand: Stand) -> Step:
+        """What the robot sees there. It has a view and a star, but no truth."""
+        bearings = _bearings(self.plan, stand)
+        return Step(_view(bearings), star=_star(self.plan, stand, bearings, self.spread))
+
+    def ends(self, stand: Stand) -> dict[Action, Stand]:
+        """What the robot can do there, and where that ends: a turn to each other gateway, and a travel where it faces one."""
+        return dict(next(self.way_through(stand, goal)) for goal in range(len(self.plan.gateways[stand.room])))
+
+    def way_through(self, stand: Stand, goal: int) -> Iterator[tuple[Action, Stand]]:
+        """The actions that lead through a gateway of the room, and where each of them ends."""
+        return _way_through(self.plan, stand, goal)
 
 
 def _drive(plan: Plan, steps: int, chance: np.random.Generator) -> Iterator[tuple[Stand, Action | None]]:
@@ -296,10 +329,22 @@ def _bearings(plan: Plan, stand: Stand) -> tuple[float, ...]:
 
 
 def _sighted(plan: Plan, stand: Stand, spread: float, chance: np.random.Generator) -> tuple[Sighted, ...]:
-    """The star as the robot sees it: each bearing is off by at most `spread` degrees. Doors through which one path goes on are told to be opposite."""
+    """The star as the robot sees it: each bearing is off by at most `spread` degrees."""
     found = plan.gateways[stand.room]
     off = chance.uniform(-spread, spread, len(found)).tolist()
     bearings = [round(bearing + wrong, 3) % 360 for bearing, wrong in zip(_bearings(plan, stand), off, strict=True)]
+    return _star(plan, stand, bearings, spread)
+
+
+def _view(bearings: Sequence[float]) -> str:
+    """The number of doors and their rough directions."""
+    rough = sorted({round(bearing / COARSE) * COARSE % 360 for bearing in bearings})
+    return f"{len(bearings)} door{'s' * (len(bearings) > 1)}: {' '.join(map(str, rough))}"
+
+
+def _star(plan: Plan, stand: Stand, bearings: Sequence[float], spread: float) -> tuple[Sighted, ...]:
+    """The star of gateways that are seen at these bearings, in their order. Doors through which one path goes on are told to be opposite."""
+    found = plan.gateways[stand.room]
     order = sorted(range(len(found)), key=lambda k: bearings[k])
     opposite = [found[k].opposite for k in order]
     return tuple(

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from ssh_abduction.engines.base import Cost
     from ssh_abduction.errors import LocaliserError, MapError, RangeError, SolverError, SSHError, TheoryError, TraceError
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
+    from ssh_abduction.explorer import Exploration, Explorer
     from ssh_abduction.export.formats import export_map
     from ssh_abduction.localize import Belief, Chances, Localiser
     from ssh_abduction.maps import DState, Fit, Path, Pose, SSHMap
@@ -39,6 +40,7 @@ _HOMES = {  # module: the names that it exports
     "errors": ("LocaliserError", "MapError", "RangeError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
     "export.formats": ("export_map",),
+    "explorer": ("Exploration", "Explorer"),
     "localize": ("Belief", "Chances", "Localiser"),
     "maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
     "odometry": ("Odometry",),
@@ -71,6 +73,8 @@ __all__ = [
     "Difference",
     "Evaluation",
     "Experiment",
+    "Exploration",
+    "Explorer",
     "Fit",
     "Level",
     "Listing",

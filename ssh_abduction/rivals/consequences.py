@@ -91,6 +91,16 @@ class Consequences:
             return self._travelled(s)
         return OPEN
 
+    def sure_ends(self, actions: Sequence[Action]) -> tuple[tuple[int, str, int], ...]:
+        """Dstates, actions that were never tried there, and the dstates that the axioms imply for their ends."""
+        turns = [action for action in actions if action.kind == "turn"]
+        if not (self._framed or (self._turns_back and self._at)):
+            return ()
+        found = (
+            (s.id, action.name, self._turned(s, action)) for s in self._dstates for action in turns if action.name not in self._links[s.id]
+        )
+        return tuple((s, action, says.dstate) for s, action, says in found if says.dstate is not None)
+
     def _turned(self, s: DState, action: Action) -> Consequence:
         assert action.turn is not None
         if s.place in self._seen_at and s.heading is not None and action.in_quarters:

@@ -12,7 +12,7 @@ states are known, and not a homing sequence.
 
 Through known links
 -------------------
-Each map predicts what is seen along the links that it knows. A sequence of actions is followed while all rivals that are left know each link; once their predictions differ, what is seen
+Each map predicts what is seen along the links that it knows; with `implied` also along those that the axioms imply: where places have frames, four turns right lead back (consequences.py). A sequence of actions is followed while all rivals that are left know each link; once their predictions differ, what is seen
 leaves some of them.
 
 *Two rivals.* The two maps go from joint state to joint state. Breadth first finds the fewest actions after which the two predict something different, or that there are none: exactly, as what
@@ -43,7 +43,7 @@ from ssh_abduction.asp.limits import LimitError, Stop, Watch, check_limit
 from ssh_abduction.errors import MapError, brief, printable
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.rivals.consequences import Consequence, Consequences, is_possible
-from ssh_abduction.rivals.machines import UNKNOWN, Machine, Row, Seen, Sights, Table, Walk, links_of, machine_of
+from ssh_abduction.rivals.machines import UNKNOWN, Machine, Row, Seen, Sights, Table, Walk, links_of, machine_of, with_ends
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.sharing import stretches
 from ssh_abduction.theory.theory import Theory
@@ -224,7 +224,9 @@ def next_experiment(
     *,
     theory: Theory | None = None,
     complete: bool = True,
+    actions: Iterable[Action | str] = (),
     can: Can | None = None,
+    implied: bool = False,
     limit: float | None = None,
     memory: float | None = None,
     watch: Watch | None = None,
@@ -235,7 +237,9 @@ def next_experiment(
     trace     the trace that they explain: its stars are predicted beside views, and it says of which kind actions are
     theory    under which the maps were solved: it says how stars are read, and which axioms tell the ends of untried actions. Where it is missing, stars are read unless a dstate of some map shows two
     complete  whether these are all minimal maps
-    can       what the robot can do where this is seen; by default any action of the trace, as far as the star lets it
+    actions   what else the robot can do, beside the actions that some map has a link for
+    can       names of what the robot can do where this is seen; by default any of these actions, as far as the star lets it
+    implied   whether it may lead through links that no rival has, but that follow from the axioms
     limit, memory  seconds, and MiB that the process may use. When they are over, the plan so far is the answer
     watch     the limits of a caller that may interrupt, instead of these two
 
@@ -251,7 +255,7 @@ def next_experiment(
         watch = Watch(limit, memory)
     watch.use_reserve()
     watch.start()
-    laboratory = _Laboratory(rivals, trace, theory, can, watch)
+    laboratory = _Laboratory(rivals, trace, theory, [Action.of(action) for action in actions], can, implied, watch)
     plan = laboratory.plan()
     watch.stop()
     return Experiment(
@@ -266,29 +270,43 @@ class _Laboratory:
     stopped  why the search was ended, else None
     """
 
-    def __init__(self, rivals: Sequence[SSHMap], trace: Trace | None, theory: Theory | None, can: Can | None, watch: Watch) -> None:
+    def __init__(
+        self,
+        rivals: Sequence[SSHMap],
+        trace: Trace | None,
+        theory: Theory | None,
+        actions: Sequence[Action],
+        can: Can | None,
+        implied: bool,
+        watch: Watch,
+    ) -> None:
         settled = theory if theory is None or trace is None else theory.resolve(trace)
-        self._rivals, self._theory, self._can, self._watch = rivals, settled, can, watch
+        self._can, self._watch = can, watch
         self._sights = Sights(rivals, trace, theory)
         self._links = [links_of(ssh_map, i) for i, ssh_map in enumerate(rivals)]
         self.stopped: Stop | None = None
-        names = sorted({action for ssh_map in rivals for _, action, _ in ssh_map.links})
-        of_trace = {action.name: action for action in trace.actions} if trace else {}
-        self._actions = [of_trace.get(name) or Action.of(name) for name in names]
+        known = {action.name: action for action in (*actions, *(trace.actions if trace else ()))}
+        names = sorted({action for ssh_map in rivals for _, action, _ in ssh_map.links} | {action.name for action in actions})
+        self._actions = [known.get(name) or Action.of(name) for name in names]
+        self._consequences = [
+            Consequences(ssh_map, self._links[i], [self._sights.seen[k] for k in self._sights.of[i]], settled)
+            for i, ssh_map in enumerate(rivals)
+        ]
+        self._said: dict[tuple[int, int, int], Consequence] = {}
         found: dict[Machine, list[int]] = {}
         self._reached: list[tuple[int, ...]] = []  # for each rival the dstate that each state of its machine is
         same: dict[object, tuple[Machine, tuple[int, ...]]] = {}  # as of many rivals that differ in paths alone there is one machine
         for i, ssh_map in enumerate(rivals):
-            key = (ssh_map.labels[-1], ssh_map.links, tuple(self._sights.of[i]))
+            known_ends = self._consequences[i].sure_ends(self._actions) if implied else ()
+            key = (ssh_map.labels[-1], ssh_map.links, known_ends, tuple(self._sights.of[i]))
             if key not in same:
-                same[key] = machine_of(ssh_map.labels[-1], self._links[i], self._sights.of[i])
+                links = with_ends(self._links[i], known_ends)
+                same[key] = machine_of(ssh_map.labels[-1], links, self._sights.of[i])
             machine, reached = same[key]
             found.setdefault(machine, []).append(i)
             self._reached.append(reached)
         self._groups = list(found.values())
         self._table = Table(list(found), names)
-        self._consequences: dict[int, Consequences] = {}
-        self._said: dict[tuple[int, int, int], Consequence] = {}
 
     @property
     def alike(self) -> tuple[tuple[int, ...], ...]:
@@ -395,9 +413,6 @@ class _Laboratory:
     def _consequence(self, rival: int, dstate: int, action: int) -> Consequence:
         key = rival, dstate, action
         if key not in self._said:
-            if rival not in self._consequences:
-                looks = [self._sights.seen[k] for k in self._sights.of[rival]]
-                self._consequences[rival] = Consequences(self._rivals[rival], self._links[rival], looks, self._theory)
             self._said[key] = self._consequences[rival].of(dstate, self._actions[action])
         return self._said[key]
 

@@ -179,6 +179,14 @@ def links_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
     return found
 
 
+def with_ends(links: Mapping[int, Mapping[str, int]], ends: Sequence[tuple[int, str, int]]) -> dict[int, dict[str, int]]:
+    """Links, and others beside them, in the order of the names of actions."""
+    found: dict[int, dict[str, int]] = {s: dict(tried) for s, tried in links.items()}
+    for source, action, target in ends:
+        found[source][action] = target
+    return {s: dict(sorted(tried.items())) for s, tried in found.items()}
+
+
 def machine_of(start: int, links: Mapping[int, Mapping[str, int]], sights: Sequence[int]) -> tuple[Machine, tuple[int, ...]]:
     """The machine of a map, and the dstate that each of its states is."""
     number, reached = {start: 0}, [start]

@@ -1,0 +1,441 @@
+"""How soon does a robot have the true map, and no other? One that does what tells its maps apart, against a random walk, a fixed rule, and AALpy's hW.
+
+    python benchmarks/exploring.py --family mazes --cells 3 --seeds 20 --out results.jsonl
+    python benchmarks/exploring.py --family plans --only Borchen4,Sabadell1 --out results.jsonl
+    python benchmarks/exploring.py --table results.jsonl [--plot docs/exploring.png]
+
+Runs are paired: all begin in the same world and at the same dstate. A robot *has the map* after so many steps if all minimal maps of these steps have the true dstates, all of them, and the true places, if the
+theory has places; and if it has done every travel. Maps that differ in paths alone count as one. For the walks this is sought in the trace afterwards: from the step on at which everything was visited, after
+ever more steps, and then by halving. The explorer also says itself when it is done.
+
+    explorer       Explorer of ssh_abduction/explorer.py
+    random         any action that the robot can do, evenly
+    rule           mazes: looks around at each place, then follows the wall to its right. Plans: the drive of simulator/plans.py, through the door that was passed least often, which knows where the robot is
+    hW             AALpy's learner without resets. Its oracle knows the truth and costs nothing but the steps of a shortest counterexample, and so does an action that cannot be done: so hW is better here than
+                   it could be. It is told views, with stars on plans, learns all links, and has done once its machine predicts the same as the world
+
+Theories: mazes topological, with stars; plans causal, with stars that are alike in tolerance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import statistics
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from instances import HEADINGS, TURNS, doors_of
+from truth import Known, is_true, share_all
+
+from simulator.plans import Floor, Plan
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.explorer import Explorer
+from ssh_abduction.trace import Action, Step
+
+ROOT = Path(__file__).parent.parent
+MOVES = {name: Action.of(name) for name in ("travel", "right", "around", "left")}
+STRATEGIES = ("explorer", "random", "rule", "hW")
+Record = dict[str, Any]
+
+
+class World(Protocol):
+    """A world that a robot can be driven in: its states are true dstates."""
+
+    name: str
+    theory: Theory
+    margin: int
+    start: Any
+
+    def sight(self, state: Any) -> Step: ...
+
+    def ends(self, state: Any) -> dict[Action, Any]: ...
+
+    def place(self, state: Any) -> Hashable: ...
+
+    def rule(self) -> Iterator[Action]:
+        """A tour by a fixed rule."""
+
+
+class Maze:
+    """A maze of corridors, of so many cells each way. A dstate is a cell and a heading, a view the openings ahead, right, back and left. The robot turns to any side."""
+
+    theory, margin = Theory.topological(), 2
+
+    def __init__(self, cells: int, seed: int) -> None:
+        chance = random.Random(seed)
+        self.name = f"maze {cells} x {cells}, {seed}"
+        self._doors = doors_of(cells, cells, chance)
+        self.start = (chance.randrange(cells), chance.randrange(cells), chance.randrange(4))
+
+    def sight(self, state: tuple[int, int, int]) -> Step:
+        star = tuple(int((state[:2], ahead(state, turn)) in self._doors) for turn in range(4))
+        return Step("".join(map(str, star)), star=star)
+
+    def ends(self, state: tuple[int, int, int]) -> dict[Action, tuple[int, int, int]]:
+        x, y, heading = state
+        found = {MOVES[name]: (x, y, (heading + turn) % 4) for name, turn in TURNS.items()}
+        return found | ({MOVES["travel"]: (*ahead(state, 0), heading)} if (state[:2], ahead(state, 0)) in self._doors else {})
+
+    def place(self, state: tuple[int, int, int]) -> Hashable:
+        return state[:2]
+
+    def rule(self) -> Iterator[Action]:
+        """At each place look around, then follow the wall to the right."""
+        state = self.start
+        while True:
+            yield from [MOVES["right"]] * 4
+            turn = next(turn for turn in (1, 0, 3, 2) if (state[:2], ahead(state, turn)) in self._doors)
+            yield from [move for name, move in MOVES.items() if TURNS.get(name) == turn]
+            yield MOVES["travel"]
+            state = (*ahead(state, turn), (state[2] + turn) % 4)
+
+
+def ahead(state: tuple[int, int, int], turn: int) -> tuple[int, int]:
+    """The cell that the robot faces once it has turned by so many quarters."""
+    dx, dy = HEADINGS[(state[2] + turn) % 4]
+    return state[0] + dx, state[1] + dy
+
+
+class Building:
+    """A floor plan, whose rooms are places."""
+
+    theory, margin = Theory.causal().replace(star="alike"), 0
+
+    def __init__(self, file: Path) -> None:
+        self._floor = Floor(Plan.load(file).told_apart())
+        self.name, self.start = self._floor.plan.name, self._floor.start
+        self.sight, self.ends = self._floor.sight, self._floor.ends
+
+    def place(self, state: Any) -> Hashable:
+        return state.room
+
+    def rule(self) -> Iterator[Action]:
+        """Turn to the door of the room that was passed least often, not the one behind if there is another, and travel through it."""
+        state, passed, came_by = self.start, dict[int, int](), -1
+        while True:
+            gateways = self._floor.plan.gateways[state.room]
+            choices = [k for k, g in enumerate(gateways) if g.door != came_by] or [*range(len(gateways))]
+            goal = min(choices, key=lambda k: (passed.get(gateways[k].door, 0), k))
+            came_by = gateways[goal].door
+            for action, after in self._floor.way_through(state, goal):
+                yield action
+                state = after
+            passed[came_by] = passed.get(came_by, 0) + 1
+
+
+@dataclass
+class Driven:
+    """A robot in a world, and all that it did there."""
+
+    world: World
+
+    def __post_init__(self) -> None:
+        self.truth = [self.world.start]
+        self.steps: list[Step] = []
+        self.done: list[Action] = []
+
+    def look(self) -> Step:
+        return self.world.sight(self.truth[-1])
+
+    def can(self) -> Collection[Action]:
+        return list(self.world.ends(self.truth[-1]))
+
+    def do(self, action: Action) -> None:
+        self.done.append(action)
+        self.truth.append(self.world.ends(self.truth[-1])[action])
+
+    def trace(self, actions: int) -> Trace:
+        """The trace of the first actions."""
+        seen = [self.world.sight(state) for state in self.truth[: actions + 1]]
+        return Trace.from_steps([step.view for step in seen], self.done[:actions], stars=[step.star for step in seen])  # type: ignore[arg-type, misc]
+
+
+def states_of(world: World) -> dict[Any, dict[Action, Any]]:
+    """All dstates, and where actions lead."""
+    found: dict[Any, dict[Action, Any]] = {}
+    left = [world.start]
+    while left:
+        state = left.pop()
+        if state not in found:
+            found[state] = world.ends(state)
+            left += found[state].values()
+    return found
+
+
+def everything(ends: dict[Any, dict[Action, Any]]) -> set[Any]:
+    """What has to be seen and done: all dstates, and all travels."""
+    return {*ends} | {(state, action.name) for state in ends for action in ends[state] if action.kind == "travel"}
+
+
+def covered_after(robot: Driven) -> int | None:
+    """After how many actions all dstates were visited and all travels done; None if that never was."""
+    ends = states_of(robot.world)
+    missing = everything(ends) - {robot.truth[0]}
+    for t, action in enumerate(robot.done, 1):
+        missing -= {robot.truth[t], (robot.truth[t - 1], action.name)}
+        if not missing:
+            return t
+    return None
+
+
+def has_map(robot: Driven, actions: int, limit: float) -> bool:
+    """Whether the minimal maps of the first actions are true, and differ in paths at most."""
+    trace = robot.trace(actions)
+    truth = tuple(robot.truth[: actions + 1])
+    known = Known("", trace, truth, tuple(map(robot.world.place, truth)))
+    solution = solve(trace, robot.world.theory, limit=limit, maps=20)
+    return bool(solution.maps) and all(is_true(m, known) for m in solution.maps) and (solution.complete or share_all(solution))
+
+
+def steps_to_map(robot: Driven, limit: float) -> int | None:
+    """After how many actions the robot had the map; None if it never had."""
+    low = covered_after(robot)
+    if low is None:
+        return None
+    high, last = low, len(robot.done)
+    while not has_map(robot, high, limit):
+        if high == last:
+            return None
+        low, high = high + 1, min(last, high + max(high // 8, 4))
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if has_map(robot, middle, limit) else (middle + 1, high)
+    return high
+
+
+def explorer(world: World, seed: int, most: int, limit: float) -> Record:
+    robot = Driven(world)
+    found = Explorer(robot, world.theory, margin=world.margin, limit=limit)
+    began = time.perf_counter()
+    while len(robot.done) < most and found.step():
+        pass
+    spent = time.perf_counter() - began
+    ending = {"stopped": len(robot.done), "done": found.done, "certain": found.certain, "true": has_map(robot, len(robot.done), 10 * limit)}
+    return {"steps": steps_to_map(robot, limit), **ending, "weighed": found.weighed, "seconds": round(spent, 1)}
+
+
+def random_walk(world: World, seed: int, most: int, limit: float) -> Record:
+    robot, chance = Driven(world), random.Random(f"walk {seed}")
+    return walked(robot, (chance.choice([*robot.can()]) for _ in range(most)), limit)
+
+
+def rule(world: World, seed: int, most: int, limit: float) -> Record:
+    return walked(Driven(world), (action for action, _ in zip(world.rule(), range(most), strict=False)), limit)
+
+
+def walked(robot: Driven, actions: Iterator[Action], limit: float) -> Record:
+    """Do these actions, until some time after everything was visited."""
+    began = time.perf_counter()
+    missing = everything(states_of(robot.world))
+    after = 0
+    for action in actions:
+        missing -= {robot.truth[-1], (robot.truth[-1], action.name)}
+        robot.do(action)
+        after = 0 if missing - {robot.truth[-1]} else after + 1
+        if after > len(robot.done) / 2:
+            break
+    return {"steps": steps_to_map(robot, limit), "driven": len(robot.done), "seconds": round(time.perf_counter() - began, 1)}
+
+
+def learnt(world: World, seed: int, most: int, limit: float) -> Record:
+    """What AALpy's hW takes."""
+    from aalpy import SUL, hWOracle, run_hW
+
+    ends, chance = states_of(world), random.getstate()
+    letters = sorted({action.name for leads in ends.values() for action in leads})
+    by_name = {state: {action.name: there for action, there in leads.items()} for state, leads in ends.items()}
+    shows = {state: f"{(seen := world.sight(state)).view} {seen.star}" for state in ends}
+
+    class Driving(SUL):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__()
+            self.state, self.driven = world.start, 0
+
+        def pre(self) -> None: ...
+
+        def post(self) -> None: ...
+
+        def step(self, letter: str | None) -> str:
+            there = by_name[self.state].get(letter or "")
+            if there is not None:
+                self.state, self.driven = there, self.driven + 1
+                if self.driven > most:
+                    raise TooLongError
+            return shows[self.state]
+
+    driving = Driving()
+
+    class Knows(hWOracle):  # type: ignore[misc]
+        def find_cex(self, hypothesis: Any) -> tuple[str, ...] | None:
+            first = (hypothesis.current_state, driving.state)
+            came: dict[Any, tuple[Any, str] | None] = {first: None}
+            queue = deque([first])
+            while queue:
+                pair = queue.popleft()
+                if came[pair] is not None and pair[0].output != shows[pair[1]]:
+                    words: list[str] = []
+                    at: Any = pair
+                    while came[at] is not None:
+                        at, letter = came[at]  # type: ignore[misc]
+                        words.append(letter)
+                    cex: list[str] = []
+                    self._execute_and_compare(hypothesis, tuple(words[::-1]), cex)
+                    return tuple(cex)
+                for letter in letters:
+                    there = (pair[0].transitions[letter], by_name[pair[1]].get(letter, pair[1]))
+                    if there not in came:
+                        came[there] = (pair, letter)
+                        queue.append(there)
+            return None
+
+    random.seed(seed)
+    began = time.perf_counter()
+    try:
+        run_hW(letters, driving, Knows(), "moore", query_for_initial_state=False, print_level=0)
+        steps: int | None = driving.driven
+    except TooLongError:
+        steps = None
+    finally:
+        random.setstate(chance)
+    return {"steps": steps, "driven": driving.driven, "seconds": round(time.perf_counter() - began, 1)}
+
+
+class TooLongError(Exception):
+    """So many steps were done that the run is given up."""
+
+
+RUN: dict[str, Callable[[World, int, int, float], Record]] = {"explorer": explorer, "random": random_walk, "rule": rule, "hW": learnt}
+
+
+def worlds(options: argparse.Namespace) -> Iterator[tuple[World, int]]:
+    if options.family == "mazes":
+        yield from ((Maze(options.cells, seed), seed) for seed in range(options.first, options.first + options.seeds))
+        return
+    for file in sorted(options.folder.glob("*.xml"), key=lambda file: file.stem.lower()):
+        if not options.only or any(name in file.stem for name in options.only.split(",")):
+            yield from ((Building(file), seed) for seed in range(options.first, options.first + options.seeds))
+
+
+def table(records: Sequence[Record]) -> str:
+    """A row for each world, and the medians: steps until the robot has the map, and when the explorer stops."""
+    names = [*dict.fromkeys(record["world"] for record in records)]
+    by = {(record["world"], record["strategy"]): record for record in records}
+    lines = ["| world | dstates | explorer | it stops | then true | random | rule | hW | explorer / best other |", "|---" * 9 + "|"]
+    columns: dict[str, list[float]] = {name: [] for name in (*STRATEGIES, "stopped", "ratio")}
+    for name in names:
+        row = {strategy: by.get((name, strategy), {}) for strategy in STRATEGIES}
+        steps = {strategy: float("inf") if said.get("steps") is None else said["steps"] for strategy, said in row.items()}
+        best = min(steps[strategy] for strategy in STRATEGIES[1:])
+        for strategy in STRATEGIES:
+            columns[strategy].append(steps[strategy])
+        columns["stopped"].append(row["explorer"].get("stopped", float("inf")))
+        columns["ratio"].append(steps["explorer"] / best if best < float("inf") else 0.0)
+        told = [_told(steps[s], row[s]) for s in STRATEGIES]
+        ending = "yes" if row["explorer"].get("true") else "no"
+        if not row["explorer"].get("done"):
+            ending += ", not done"
+        lines.append(
+            f"| {name} | {row['explorer'].get('dstates', '')} | {told[0]} | {row['explorer'].get('stopped', '')} | {ending} | {told[1]} | {told[2]} | {told[3]} | "
+            f"{columns['ratio'][-1]:.2f} |"
+        )
+    medians = {name: statistics.median(values) for name, values in columns.items()}
+    true = sum(bool(by[name, "explorer"].get("true")) for name in names if (name, "explorer") in by)
+    lines.append(
+        f"| median of {len(names)} | | {_number(medians['explorer'])} | {_number(medians['stopped'])} | {true} of {len(names)} | {_number(medians['random'])} | {_number(medians['rule'])} | "
+        f"{_number(medians['hW'])} | {medians['ratio']:.2f} |"
+    )
+    return "\n".join(lines)
+
+
+def _told(steps: float, said: Record) -> str:
+    return _number(steps) if steps < float("inf") else f"not in {said['driven']:,}" if "driven" in said else "–"
+
+
+def _number(steps: float) -> str:
+    return "–" if steps == float("inf") else f"{steps:,g}"
+
+
+def plot(records: Sequence[Record], file: Path) -> None:
+    """A dot for each run, a line for each world."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    families = [*dict.fromkeys(record["family"] for record in records)]
+    figure, axes = plt.subplots(1, len(families), figsize=(4.2 * len(families), 3.6), sharey=True, squeeze=False)
+    for axis, family in zip(axes[0], families, strict=True):
+        some = [record for record in records if record["family"] == family]
+        runs = [*dict.fromkeys(record["world"] for record in some)]
+        for world in runs:
+            steps = {record["strategy"]: record["steps"] for record in some if record["world"] == world}
+            at = [(i, steps[s]) for i, s in enumerate(STRATEGIES) if steps.get(s)]
+            axis.plot(*zip(*at, strict=True), color="0.8", linewidth=0.7, zorder=1)
+            axis.scatter(*zip(*at, strict=True), s=14, color="#0072B2", zorder=2)
+        for i, strategy in enumerate(STRATEGIES):
+            values = [record["steps"] or float("inf") for record in some if record["strategy"] == strategy]
+            middle = statistics.median(values) if values else float("inf")
+            if middle < float("inf"):
+                axis.plot([i - 0.3, i + 0.3], [middle, middle], color="#D55E00", linewidth=2, zorder=3)
+            missing = sum(value == float("inf") for value in values)
+            if missing:
+                axis.annotate(
+                    f"{missing} of {len(values)}\nnever", (i, 1.0), xycoords=("data", "axes fraction"), ha="center", va="top", fontsize=7
+                )
+        axis.set_xticks(range(len(STRATEGIES)), STRATEGIES)
+        axis.set_title(f"{family} ({len(runs)})", fontsize=10)
+        axis.set_yscale("log")
+        axis.grid(axis="y", color="0.9")
+    axes[0][0].set_ylabel("steps until the map is unique and true")
+    figure.tight_layout()
+    figure.savefig(file, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--family", choices=("mazes", "plans"), default="mazes")
+    parser.add_argument("--cells", type=int, default=3, metavar="N", help="mazes of N x N cells (default 3)")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="worlds, or runs of each plan (default 1)")
+    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)")
+    parser.add_argument("--folder", type=Path, default=ROOT.parent / "shared" / "data" / "plans", metavar="FOLDER", help="of the plans")
+    parser.add_argument("--only", default="", metavar="NAMES", help="plans whose names have one of these parts; commas between")
+    parser.add_argument("--strategies", default=",".join(STRATEGIES), metavar="NAMES", help="which to run; commas between")
+    parser.add_argument("--most", type=int, default=20_000, metavar="N", help="give up after so many steps (default 20000); explorer 2000")
+    parser.add_argument("--limit", type=float, default=3.0, metavar="S", help="seconds for a solve, about (default 3)")
+    parser.add_argument(
+        "--out", type=Path, metavar="RESULTS.jsonl", help="where to store what came of each run; what is there is not run again"
+    )
+    parser.add_argument("--table", type=Path, metavar="RESULTS.jsonl", help="print a table of stored results instead")
+    parser.add_argument("--plot", type=Path, metavar="PNG", help="with --table, draw them, too")
+    options = parser.parse_args()
+    if options.table:
+        records = [json.loads(line) for line in options.table.read_text().splitlines()]
+        for family in dict.fromkeys(record["family"] for record in records):
+            print(f"\n{family}\n\n{table([record for record in records if record['family'] == family])}")
+        if options.plot:
+            plot(records, options.plot)
+        return
+    family = f"mazes {options.cells} x {options.cells}" if options.family == "mazes" else "plans"
+    stored = options.out.read_text().splitlines() if options.out and options.out.exists() else []
+    known = {(record["world"], record["strategy"]) for record in map(json.loads, stored)}
+    for world, seed in worlds(options):
+        for strategy in options.strategies.split(","):
+            if (world.name, strategy) in known:
+                continue
+            most = min(options.most, 2000) if strategy == "explorer" else options.most
+            said = RUN[strategy](world, seed, most, options.limit)
+            record = {"family": family, "world": world.name, "dstates": len(states_of(world)), "strategy": strategy, **said}
+            print(json.dumps(record), flush=True)
+            if options.out:
+                with options.out.open("a") as file:
+                    file.write(json.dumps(record) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,190 @@
+"""The explorer in tiny worlds: its map against the world itself, and that it says honestly why it ended."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Collection, Mapping
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from worlds import HEADINGS, PLUS, TEE, Streets, streets
+
+from ssh_abduction import Action, Exploration, Explorer, Status, Step, Theory, TheoryError, TraceError, solve
+from ssh_abduction.errors import SSHError
+
+TURNS = {"right": 1, "around": 2, "left": 3}
+CORRIDOR = streets(("a", "E", "b"), ("b", "E", "c"), ("c", "E", "d"))
+RING = streets(("a", "E", "b"), ("b", "E", "c"), ("a", "S", "d"), ("d", "E", "e"), ("e", "E", "f"), ("c", "S", "f"))
+
+
+class Streetwalker:
+    """A robot in streets. It sees the openings around it."""
+
+    def __init__(self, world: Streets, place: str, heading: str, told: bool = True) -> None:
+        self.world, self.place, self.facing, self.told = world, place, HEADINGS.index(heading), told
+        self.been = [self.truth]
+        self.done: list[str] = []
+
+    @property
+    def truth(self) -> tuple[str, int]:
+        return self.place, self.facing
+
+    def look(self) -> Step:
+        star = tuple(int(HEADINGS[(self.facing + k) % 4] in self.world[self.place]) for k in range(4))
+        truth = {"dstate": str(self.truth), "place": self.place} if self.told else None
+        return Step("".join(map(str, star)), star=star, truth=truth)
+
+    def can(self) -> Collection[Action | str]:
+        return [*TURNS, *(["travel"] if HEADINGS[self.facing] in self.world[self.place] else [])]
+
+    def do(self, action: Action) -> None:
+        assert action.name in self.can()
+        if action.name == "travel":
+            self.place = self.world[self.place][HEADINGS[self.facing]]
+        else:
+            self.facing = (self.facing + TURNS[action.name]) % 4
+        self.been.append(self.truth)
+        self.done.append(action.name)
+
+
+class Machine:
+    """A robot in a Moore machine: views, and for each state what the actions lead to."""
+
+    def __init__(self, views: str, ends: Mapping[int, Mapping[str, int]]) -> None:
+        self.views, self.ends, self.at = views, ends, 0
+
+    def look(self) -> Step:
+        return Step(self.views[self.at], truth=self.at)
+
+    def can(self) -> Collection[Action | str]:
+        return [*self.ends[self.at]]
+
+    def do(self, action: Action) -> None:
+        self.at = self.ends[self.at][action.name]
+
+
+def partition(names: Collection[Any]) -> list[int]:
+    numbers: dict[Any, int] = {}
+    return [numbers.setdefault(name, len(numbers)) for name in names]
+
+
+@pytest.mark.parametrize(
+    ("world", "start", "margin"),
+    [(CORRIDOR, "a", 1), (TEE, "W", 2), (PLUS, "W", 0), (RING, "a", 0)],
+    ids=["corridor", "tee", "plus", "ring"],
+)
+def test_streets_are_known_when_it_is_done(world: Streets, start: str, margin: int) -> None:
+    robot = Streetwalker(world, start, "E")
+    found = Explorer(robot, margin=margin).explore(200)
+    assert (found.ending, found.is_unique, found.is_true) == ("done", True, True)
+    assert found.steps == len(robot.done)
+    assert set(robot.been) == {(place, heading) for place in world for heading in range(4)}
+    travels = {before for (before, _), action in zip(pairwise(robot.been), robot.done, strict=True) if action == "travel"}
+    assert travels == {(place, HEADINGS.index(heading)) for place, ways in world.items() for heading in ways}
+    for ssh_map in found.solution.maps:
+        assert partition(ssh_map.labels) == partition(robot.been)
+
+
+def test_what_is_unique_is_what_solve_lists() -> None:
+    seen = set()
+    for seed in range(6):
+        chance = random.Random(seed)
+        ends = {s: {action: chance.randrange(6) for action in ("p", "q")} for s in range(6)}
+        robot = Machine("aabbaa", ends)
+        explorer = Explorer(robot, Theory.causal(), margin=0)
+        been = [0]
+        while explorer.step():
+            been.append(robot.at)
+            listed = solve(explorer.trace, Theory.causal(), maps=0).maps
+            found = explorer.result
+            assert found.is_unique == (len({m.labels for m in listed}) == 1)
+            assert found.is_true == ([partition(m.labels) for m in listed] == [partition(been)])
+            seen.add((found.is_unique, found.is_true))
+    assert seen == {(False, False), (True, False), (True, True)}
+
+
+def test_steps_that_are_spent_are_said() -> None:
+    found = Explorer(Streetwalker(RING, "a", "E", told=False)).explore(3)
+    assert (found.steps, found.ending, found.is_true) == (3, "steps", None)
+    assert "its steps are spent" in found.sentence
+
+
+def test_rivals_that_nothing_tells_apart_are_said() -> None:
+    # The robot is at the last state, which may be 0 or 2: p would tell, and cannot be done there.
+    one_way = {0: {"p": 1}, 1: {"n": 2}, 2: {"p": 3}, 3: {"n": 4}, 4: {}}
+    explorer = Explorer(Machine("axaza", one_way), Theory.causal())
+    found = explorer.explore(50)
+    assert (found.steps, found.ending, found.is_unique, found.is_true) == (4, "inseparable", False, False)
+    assert len(solve(explorer.trace, Theory.causal(), maps=0)) == found.solution.count > 1
+    assert "not unique" in found.sentence
+
+
+def test_the_map_of_a_world_that_hides_its_states_is_not_true() -> None:
+    blind = Explorer(Machine("aaa", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 0}}), Theory.causal()).explore(50)
+    assert (blind.ending, blind.is_unique, blind.is_true) == ("done", True, False)
+    assert "not true" in blind.sentence
+
+
+def test_a_margin_finds_what_the_fewest_dstates_hide() -> None:
+    found = {}
+    for margin in (0, 2):
+        ring = Machine("abbc", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 3}, 3: {"on": 0}})
+        found[margin] = Explorer(ring, Theory.causal(), margin=margin).explore(50)
+    assert {margin: (said.ending, said.is_true) for margin, said in found.items()} == {0: ("done", False), 2: ("done", True)}
+    assert found[0].steps == 2  # after a, b, b it takes the last two for one
+    assert found[2].steps >= 4
+
+
+class Crooked(Streetwalker):
+    """What it sees does not turn with it."""
+
+    def look(self) -> Step:
+        return Step("here", star=(1, 0, 0, 0))
+
+
+def test_no_map_is_said() -> None:
+    explorer = Explorer(Crooked(TEE, "W", "E", told=False))
+    found = explorer.explore(10)
+    assert (found.ending, found.is_unique, found.solution.status) == ("contradicted", False, Status.UNSATISFIABLE)
+    assert solve(explorer.trace).status is Status.UNSATISFIABLE
+    assert found.steps < 10
+
+
+def test_a_step_goes_on_where_exploring_was_left() -> None:
+    whole, parts = (Explorer(Streetwalker(TEE, "W", "E"), margin=0) for _ in range(2))
+    whole.explore(100)
+    while parts.explore(1).ending == "steps":
+        pass
+    assert parts.trace == whole.trace
+    assert parts.explore(100) == parts.result
+    assert not parts.step()
+    assert parts.result.to_dict()["steps"] == len(whole.trace) - 1
+
+
+class Nothing(Machine):
+    def look(self) -> Any:
+        return None
+
+
+@pytest.mark.parametrize(
+    ("build", "error", "message"),
+    [
+        (lambda robot: Explorer(robot, margin=-1), TraceError, "margin: expected a number of dstates, 0 or more, got -1"),
+        (lambda robot: Explorer(robot, margin=float("nan")), TraceError, "margin: expected a number of dstates"),
+        (lambda robot: Explorer(robot, limit=float("nan")), SSHError, "limit"),
+        (lambda robot: Explorer(robot, Theory.causal().replace(misread=1)), TheoryError, "theory: expected one without faults"),
+        (lambda robot: Explorer(Nothing("a", {0: {}})), TraceError, "look: expected a Step with a view, got None"),
+        (lambda robot: Explorer(robot).explore(-1), TraceError, "steps: expected a number of actions, 0 or more, got -1"),
+        (lambda robot: Explorer(robot).explore(2.5), TraceError, "steps: expected a number of actions"),
+    ],
+)
+def test_bad_input_is_refused(build: Any, error: type[SSHError], message: str) -> None:
+    with pytest.raises(error, match=message):
+        build(Machine("a", {0: {}}))
+
+
+def test_a_robot_that_can_do_nothing_is_done_at_once() -> None:
+    found = Explorer(Machine("a", {0: {}})).explore(10)
+    assert isinstance(found, Exploration)
+    assert (found.steps, found.ending, found.is_unique, found.is_true) == (0, "done", True, True)
