@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.difference import Difference, difference
     from ssh_abduction.rivals.explore import Experiment, next_experiment
     from ssh_abduction.rivals.listing import Listing
+    from ssh_abduction.rivals.page.html import Page, view_page
     from ssh_abduction.routes import Move, Route, route
     from ssh_abduction.rungs import Rung, ladder
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
@@ -48,6 +49,7 @@ _HOMES = {  # module: the names that it exports
     "rivals.compare": ("Comparison", "compare"),
     "rivals.difference": ("Difference", "difference"),
     "rivals.listing": ("Listing",),
+    "rivals.page.html": ("Page", "view_page"),
     "rivals.explore": ("Experiment", "next_experiment"),
     "routes": ("Move", "Route", "route"),
     "rungs": ("Rung", "ladder"),
@@ -85,6 +87,7 @@ __all__ = [
     "Move",
     "Odometry",
     "OnlineMapper",
+    "Page",
     "Path",
     "Pose",
     "Progress",
@@ -111,6 +114,7 @@ __all__ = [
     "next_experiment",
     "route",
     "solve",
+    "view_page",
 ]
 
 

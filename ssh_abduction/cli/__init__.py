@@ -36,6 +36,7 @@ from ssh_abduction.cli import (
     solve,
     theory,
     train,
+    view,
 )
 from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.verbosity import add_verbosity, telling
@@ -118,6 +119,7 @@ def parser() -> argparse.ArgumentParser:
         simulate,
         cluster,
         train,
+        view,
         reproduction,
         completion,
     ):

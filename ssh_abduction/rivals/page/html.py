@@ -1,0 +1,84 @@
+"""The page as one HTML file: nothing is loaded from elsewhere, and no text of a trace is ever read as HTML."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path as FilePath
+from typing import Any
+
+from ssh_abduction.files import write_file
+from ssh_abduction.rivals.listing import Maps
+from ssh_abduction.rivals.page.content import content_of
+from ssh_abduction.trace import Trace
+
+HERE = FilePath(__file__).parent
+ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A page about maps.
+
+    content  all that it shows, as plain data
+    """
+
+    content: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def html(self) -> str:
+        """The whole page."""
+        return html_of(self.content)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the page as an HTML file."""
+        write_file(path, self.html.encode())
+
+    def widget(self) -> Any:
+        """The page as a widget of notebooks. Raises MapError where anywidget is not installed."""
+        from ssh_abduction.rivals.page.widget import widget_of
+
+        return widget_of(self.html)
+
+
+def view_page(source: Maps, trace: Trace | None = None) -> Page:
+    """A page that shows maps, what they share and where they differ.
+
+    source  a solution, or maps of one trace
+    trace   the trace that was mapped, for its actions and laser images
+
+    Raises MapError for maps of several traces, or of another one than this.
+    """
+    return Page(content_of(source, trace))
+
+
+def html_of(content: Mapping[str, Any], *, served: bool = False) -> str:
+    """The page of this content; `served` says that a server answers its questions."""
+    style, script = _file("page.css"), _file("page.js")
+    text = json.dumps({**content, "served": served}, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    for character, escape in ESCAPED.items():
+        text = text.replace(character, escape)
+    policy = (
+        f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; connect-src {chr(39) + 'self' + chr(39) if served else chr(39) + 'none' + chr(39)}; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    page = _file("page.html")
+    for name, value in {"POLICY": policy, "STYLE": style, "SCRIPT": script, "CONTENT": text}.items():
+        before, mark, after = page.partition(f"@{name}@")
+        assert mark, name
+        page = before + value + after
+    return page
+
+
+@cache
+def _file(name: str) -> str:
+    return (HERE / name).read_text(encoding="utf-8")
+
+
+def _digest(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

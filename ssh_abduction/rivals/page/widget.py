@@ -1,0 +1,29 @@
+"""The page as a widget of notebooks, by anywidget (the extra `notebook`)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ssh_abduction.errors import MapError
+
+SHOW = """
+export default { render({ model, el }) {
+  const frame = document.createElement("iframe");
+  frame.sandbox = "allow-scripts";
+  frame.style.cssText = "width:100%;height:640px;border:1px solid #8888";
+  frame.title = "Maps";
+  frame.srcdoc = model.get("html");
+  el.append(frame);
+} };
+"""
+
+
+def widget_of(html: str) -> Any:
+    """A widget that shows a page, in a frame of its own. Raises MapError where anywidget is not installed."""
+    try:
+        import anywidget
+        import traitlets
+    except ImportError:
+        raise MapError("widget: expected anywidget, got none; install it with pip install 'ssh-abduction[notebook]'") from None
+    members = {"_esm": SHOW, "html": traitlets.Unicode(html).tag(sync=True)}
+    return type("PageWidget", (anywidget.AnyWidget,), members)()
