@@ -216,8 +216,9 @@ def explorer(world: World, seed: int, most: int, limit: float) -> Record:
     while len(robot.done) < most and found.step():
         pass
     spent = time.perf_counter() - began
-    ending = {"stopped": len(robot.done), "done": found.done, "certain": found.certain, "true": has_map(robot, len(robot.done), 10 * limit)}
-    return {"steps": steps_to_map(robot, limit), **ending, "weighed": found.weighed, "seconds": round(spent, 1)}
+    ending = found.result.ending
+    told = {"stopped": len(robot.done), "ending": ending, "done": ending == "done", "true": has_map(robot, len(robot.done), 10 * limit)}
+    return {"steps": steps_to_map(robot, limit), **told, "seconds": round(spent, 1)}
 
 
 def random_walk(world: World, seed: int, most: int, limit: float) -> Record:
@@ -335,7 +336,7 @@ def table(records: Sequence[Record]) -> str:
         for strategy in STRATEGIES:
             columns[strategy].append(steps[strategy])
         columns["stopped"].append(row["explorer"].get("stopped", float("inf")))
-        columns["ratio"].append(steps["explorer"] / best if best < float("inf") else 0.0)
+        columns["ratio"].append(steps["explorer"] / best if best < float("inf") else 0.0 if steps["explorer"] < float("inf") else 1.0)
         told = [_told(steps[s], row[s]) for s in STRATEGIES]
         ending = "yes" if row["explorer"].get("true") else "no"
         if not row["explorer"].get("done"):
@@ -376,6 +377,8 @@ def plot(records: Sequence[Record], file: Path) -> None:
         for world in runs:
             steps = {record["strategy"]: record["steps"] for record in some if record["world"] == world}
             at = [(i, steps[s]) for i, s in enumerate(STRATEGIES) if steps.get(s)]
+            if not at:
+                continue
             axis.plot(*zip(*at, strict=True), color="0.8", linewidth=0.7, zorder=1)
             axis.scatter(*zip(*at, strict=True), s=14, color="#0072B2", zorder=2)
         for i, strategy in enumerate(STRATEGIES):

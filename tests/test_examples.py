@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import contextlib
+import io
+import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -63,3 +68,28 @@ def test_adventure(tmp_path: Path) -> None:
     assert run(str(EXAMPLES / "adventure.py")).endswith("6 rooms, 1 minimal map(s)\nthe map is the maze\n")
     run(str(EXAMPLES / "adventure.py"), "--play", str(tmp_path / "again.jsonl"))
     assert (tmp_path / "again.jsonl").read_text() == (EXAMPLES / "adventure.jsonl").read_text()
+
+
+def test_the_notebook_tells_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each cell prints and returns what is stored beside it."""
+    cells = json.loads((EXAMPLES / "story.ipynb").read_text(encoding="utf-8"))["cells"]
+    assert len(cells) == 20
+    monkeypatch.chdir(EXAMPLES)
+    space: dict[str, Any] = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            said, value = executed("".join(cell["source"]), space)
+            stored = {output["output_type"]: output for output in cell["outputs"]}
+            assert said == "".join(stored.get("stream", {}).get("text", ()))
+            shown = stored.get("execute_result")
+            assert (None if value is None else repr(value)) == (shown and "".join(shown["data"]["text/plain"]))
+
+
+def executed(text: str, space: dict[str, Any]) -> tuple[str, object]:
+    """What a cell prints, and the value of its last line, as notebooks have it."""
+    tree = ast.parse(text)
+    last = ast.Expression(tree.body.pop().value) if isinstance(tree.body[-1], ast.Expr) else None
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        exec(compile(tree, "cell", "exec"), space)
+        value = eval(compile(last, "cell", "eval"), space) if last else None
+    return said.getvalue(), value

@@ -70,7 +70,7 @@ def test_the_shell_lines_print_what_is_shown(lines: str, output: str, tmp_path: 
 
 
 def test_what_is_shown_is_run() -> None:
-    assert (len(shown("python")), len(shown("sh"))) == (19, 12)
+    assert (len(shown("python")), len(shown("sh"))) == (20, 12)
 
 
 def test_the_command_line_knows_all_that_is_shown() -> None:
