@@ -1,0 +1,95 @@
+"""What a robot's log holds, whatever its format: laser scans in the order in which they were taken, and where the odometer was at each.
+
+>>> import math
+>>> from perception.readers.scans import Laser
+>>> laser = Laser(first=-math.pi / 2, step=math.pi / 2, beams=3, reach=8.0)
+>>> [round(math.degrees(bearing)) for bearing in laser.bearings]
+[-90, 0, 90]
+
+Angles are radians counterclockwise, lengths metres; a pose is (x, y, heading). In the frame of the robot x is ahead and y to its left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Pose: TypeAlias = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Laser:
+    """A laser scanner: where its beams go.
+
+    first, step  bearing of the first beam, and from each beam to the next, in radians counterclockwise from straight ahead
+    beams        how many beams a scan has
+    reach        metres beyond which a range says only that nothing was nearer
+    mount        the pose of the scanner in the frame of the robot
+    """
+
+    first: float
+    step: float
+    beams: int
+    reach: float
+    mount: Pose = (0.0, 0.0, 0.0)
+
+    @cached_property
+    def bearings(self) -> NDArray[np.float64]:
+        """The bearing of each beam in the frame of the scanner, (beams,), radians."""
+        return self.first + self.step * np.arange(self.beams, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One scan, and where the robot was when it was taken.
+
+    ranges     (beams,), metres; infinite where nothing came back, or only from beyond the laser's reach; NaN where a range is no measurement
+    odometry   pose by the odometer, which starts anywhere and drifts; only its increments mean anything
+    corrected  pose by whoever corrected the log, for pictures and evaluation only: nothing that infers reads it
+    time       seconds, by the clock of the log, which may be cut, wrapped or missing
+    line       where the scan is in the log: its line, or the number of its message, counted from 1
+    """
+
+    ranges: NDArray[np.float64]
+    laser: Laser
+    odometry: Pose
+    corrected: Pose | None = None
+    time: float | None = None
+    line: int = 0
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A part of a log that cannot be read, and was skipped.
+
+    line  its line, or the number of its message, counted from 1
+    what  what was expected there, and what came
+    """
+
+    line: int
+    what: str
+
+
+@dataclass(frozen=True, eq=False)
+class RobotLog:
+    """All that was read of a log.
+
+    scans    in the order of the file
+    damaged  what was skipped, in the order of the file
+    format   the name of the format, as the readers call it
+    source   the file
+    notes    what a reader has to know of this log, in sentences, such as that its odometry was pieced together
+    """
+
+    scans: tuple[Scan, ...]
+    damaged: tuple[Damage, ...] = ()
+    format: str = ""
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.scans)
