@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.drive import Recorder
 from simulator.errors import SimulatorError
 from simulator.laser import Laser
 from simulator.robot import Robot
@@ -50,7 +51,11 @@ class Tolerance:
 
 @dataclass
 class Driver:
-    """A robot in a world, with its laser: what control laws may use. `on_travel` is called with the robot after each stride."""
+    """A robot in a world, with its laser: what control laws may use.
+
+    on_travel  is called with the driver after each stride of a travel
+    recorder   notes where the robot is after each motion, for a log
+    """
 
     world: World
     robot: Robot
@@ -58,6 +63,7 @@ class Driver:
     rng: np.random.Generator
     tolerance: Tolerance = Tolerance()
     on_travel: Callable[[Driver], None] | None = None
+    recorder: Recorder | None = None
 
     def look(self, images: int = 1) -> Array:
         """An image, (180,) metres: the median of so many images, beam by beam."""
@@ -77,6 +83,8 @@ class Driver:
             raise SimulatorError(
                 f"{self.world.name}: the robot hit a wall at ({x:.2f}, {y:.2f}); give it {self.robot.body.radius} m of room"
             )
+        if self.recorder:
+            self.recorder.note(self.world, self.robot.pose)
 
 
 def act(driver: Driver, action: str) -> None:

@@ -10,14 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.control import STILL, Driver, Tolerance, act, climb
+from simulator.drive import EVERY, Drive, Recorder
 from simulator.errors import SimulatorError
 from simulator.junctions import ACTIONS, Pilot
 from simulator.laser import Laser
 from simulator.motion import DIGITS
+from simulator.odometer import Odometer
 from simulator.panorama import Camera
 from simulator.robot import Body, Report, Robot
 from simulator.world import World
-from ssh_abduction.odometry import Covariance, Displacement, Odometry
+from ssh_abduction.odometry import Covariance, Displacement
+from ssh_abduction.odometry import Odometry as Noise
 from ssh_abduction.trace import Action, Step, Trace
 
 Array = NDArray[np.float64]
@@ -74,21 +77,11 @@ def simulate(
     the trace's odometry is the noise that fits them. The truth goes into `truth`: dstate, place, path and pose. Nothing but evaluation may read it.
     Raises SimulatorError where the route cannot be driven.
     """
-    if tours < 1:
-        raise SimulatorError(f"tours: expected 1 or more, got {tours}")
     if every is not None and not (math.isfinite(every) and every > 0):
         raise SimulatorError(f"every: expected a number of metres above 0, got {every}; leave it out for images at dstates")
-    if not world.route:
-        raise SimulatorError(f"{world.name}: route: expected at least one action, got none; add it to the world, or give one")
-    body = body or Body()
-    x, y, _ = world.start
-    if not world.holds(x, y) or world.clearance(x, y) < body.radius:
-        raise SimulatorError(f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, {y}); move it")
-    rng = np.random.default_rng(seed)
-    robot = Robot(body, world.start, rng)
-    tolerance = tolerance or Tolerance()
-    driver = Driver(world.arranged(rng), robot, laser or Laser(), rng, tolerance)
-    log = Log(robot)
+    driver = _driver(world, tours, seed, laser, body, tolerance)
+    body, tolerance = driver.robot.body, driver.tolerance
+    log = Log(driver.robot)
     eye = Eye(camera, len(world.segments), np.random.default_rng([seed, 1]), tours * len(world.route))
     steps = list(_at_dstates(driver, log, world, tours, stars, eye)) if every is None else _evenly(driver, log, world, tours, every, eye)
     steps[-1] = replace(steps[-1], action=None)
@@ -97,10 +90,56 @@ def simulate(
     return Trace(tuple(steps), name=f"{world.name}, {tours} tours, seed {seed}", odometry=odometry, extra=extra)
 
 
-def _noise(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> Odometry:
+def record(
+    world: World,
+    tours: int = 1,
+    seed: int = 0,
+    *,
+    laser: Laser | None = None,
+    body: Body | None = None,
+    odometer: Odometer | None = None,
+    every: float = EVERY,
+) -> Drive:
+    """Drive `tours` tours as `simulate` does, and log scans all along: each `every` metres, and in turns each ten degrees.
+
+    The odometer of the log is none that the control laws steer by: its noise is that of robots that were logged. Raises SimulatorError where the route cannot be driven.
+    """
+    driver = _driver(world, tours, seed, laser, body, None)
+    recorder = driver.recorder = Recorder(every)
+    recorder.note(driver.world, driver.robot.pose)
+    steps = []
+    for _, action in _legs(driver, world, tours):
+        steps.append({"scan": recorder.taken - 1, **_truth(world, driver.robot.pose), "action": action})
+    name = f"{world.name}, {tours} tours, seed {seed}"
+    drive = recorder.drive(name, driver.laser, odometer or Odometer(), seed)
+    places = {state.place: state.pose[:2] for state in world.dstates}
+    return drive.judged(places, [_place(world, pose) for pose in drive.poses], steps=steps)
+
+
+def _place(world: World, pose: Array) -> str | None:
+    """The place where a robot is: the nearest one, where that is at most `reach` away; None between places."""
+    nearest = min(world.dstates, key=lambda state: math.dist(state.pose[:2], pose[:2]), default=None)
+    return nearest.place if nearest and math.dist(nearest.pose[:2], pose[:2]) <= world.reach else None
+
+
+def _driver(world: World, tours: int, seed: int, laser: Laser | None, body: Body | None, tolerance: Tolerance | None) -> Driver:
+    """A robot at the start of a world. Raises SimulatorError where no tour can begin."""
+    if tours < 1:
+        raise SimulatorError(f"tours: expected 1 or more, got {tours}")
+    if not world.route:
+        raise SimulatorError(f"{world.name}: route: expected at least one action, got none; add it to the world, or give one")
+    body = body or Body()
+    x, y, _ = world.start
+    if not world.holds(x, y) or world.clearance(x, y) < body.radius:
+        raise SimulatorError(f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, {y}); move it")
+    rng = np.random.default_rng(seed)
+    return Driver(world.arranged(rng), Robot(body, world.start, rng), laser or Laser(), rng, tolerance or Tolerance())
+
+
+def _noise(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> Noise:
     """What the displacements are worth. Where each has a covariance, only the errors that repeat are left to say."""
     if world.angles == "any" and tolerance is not None:
-        return Odometry(scale=abs(body.scale), bend=abs(body.bend))
+        return Noise(scale=abs(body.scale), bend=abs(body.bend))
     return noise_model(log.reports, body, tolerance)
 
 
@@ -144,7 +183,7 @@ class Log:
         return dx, dy, turned
 
 
-def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | None = None) -> Odometry:
+def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | None = None) -> Noise:
     """The noise of the displacements between dstates, from that of the robot's wheels and from the tolerance of hill-climbing.
 
     Each motion that the wheels report errs by a share of itself, so that of many motions together a smaller share is wrong. The shares of a
@@ -169,7 +208,7 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
         "scale": abs(body.scale),
         "bend": abs(body.bend),
     }
-    return Odometry.of({name: round(error, 6) for name, error in errors.items()})
+    return Noise.of({name: round(error, 6) for name, error in errors.items()})
 
 
 def _at_dstates(driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye) -> Iterator[Step]:
@@ -254,16 +293,21 @@ def _evenly(driver: Driver, log: Log, world: World, tours: int, every: float, ey
             due += every
 
     driver.on_travel = look
+    for leg, _ in _legs(driver, world, tours):  # noqa: B007 - `look` reads the number of the leg
+        leg_began = driver.robot.driven
+    return logged
+
+
+def _legs(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]:
+    """Drive all tours. Before each action its number, and what it is."""
     pilot = Pilot(driver) if world.angles == "any" else None
     pilot.begin() if pilot else climb(driver)
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
-        for action in world.route:
-            leg_began = driver.robot.driven
+        for number, action in enumerate(world.route, tour * len(world.route)):
+            yield number, action
             pilot.act(action) if pilot else act(driver, action)
-            leg += 1
-    return logged
 
 
 def _truth(world: World, pose: Sequence[float]) -> dict[str, object]:

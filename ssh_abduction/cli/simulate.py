@@ -10,6 +10,10 @@ from ssh_abduction.cli.text import counted
 from ssh_abduction.errors import SSHError, named, printable
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from perception.readers.scans import Scan
+    from simulator.drive import Drive
     from simulator.panorama import Camera
     from ssh_abduction.trace import Trace
 
@@ -66,6 +70,17 @@ def run(options: argparse.Namespace) -> int:
         trace = _with_table(trace, options.output)
     write(trace, options.output, f"{counted(len(trace), 'images')} of {printable(world.name)}")
     return 0
+
+
+def scans_of(drive: Drive) -> Iterator[Scan]:
+    """What a robot's log holds of a drive: its scans, with the true poses as the corrected ones."""
+    from perception.readers.scans import Laser, Scan
+    from simulator.laser import BEAMS, BEARINGS
+
+    laser = Laser(float(BEARINGS[0]), float(BEARINGS[1] - BEARINGS[0]), BEAMS, drive.laser.reach)
+    rows = zip(drive.ranges, drive.odometry.tolist(), drive.poses.tolist(), drive.times.tolist(), strict=True)
+    for line, (ranges, odometry, pose, time) in enumerate(rows, 1):
+        yield Scan(ranges, laser, tuple(odometry), tuple(pose), time, line)
 
 
 def _camera(options: argparse.Namespace) -> Camera | None:

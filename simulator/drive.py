@@ -1,0 +1,151 @@
+"""A drive as a robot logs it: scans taken all along, what the odometer said at each, and, for evaluation only, where the robot really was.
+
+While the robot drives, a Recorder notes its pose after each motion. When the drive has ended, all scans are computed at once, and the odometer reads the way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.errors import SimulatorError
+from simulator.laser import Laser
+from simulator.motion import Pose, between, moved
+from simulator.odometer import Odometer
+from simulator.world import World
+from ssh_abduction.errors import brief, is_finite
+
+Array = NDArray[np.float64]
+# Metres and radians a second at which the robot drives and turns.
+SPEED, SPIN = 0.5, 1.0
+# Metres after which a scan is taken.
+EVERY = 0.25
+# A motion is noted in parts, of which so many are as far as it is from scan to scan, so that scans are evenly spaced.
+FINE = 5
+TINY = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A drive that has ended.
+
+    ranges    (n, beams) metres; infinite where the laser saw nothing within its reach
+    odometry  (n, 3): x, y, heading by the odometer, which begins at (0, 0, 0); metres and radians
+    poses     (n, 3): the same in truth
+    times     (n,) seconds since the drive began
+    metres    how far the robot drove
+    odometer  the noise of the odometry
+    laser     the scanner
+    truth     what is known about places, for evaluation only; plain data
+    """
+
+    name: str
+    ranges: Array = field(repr=False)
+    odometry: Array = field(repr=False)
+    poses: Array = field(repr=False)
+    times: Array = field(repr=False)
+    metres: float
+    odometer: Odometer
+    laser: Laser
+    truth: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.ranges)
+
+    def judged(self, places: Mapping[str, Sequence[float]], scans: Sequence[str | None], **more: object) -> Drive:
+        """This drive with the truth that a map of it is judged by: where the places are, in metres, and at which of them each scan was taken."""
+        visits: list[dict[str, Any]] = []
+        for number, place in enumerate(scans):
+            if place is not None:
+                if not visits or visits[-1]["place"] != place:
+                    visits.append({"place": place, "first": number, "last": number})
+                visits[-1]["last"] = number
+        truth = {
+            "format": "ssh-drive",
+            "version": 1,
+            "name": self.name,
+            "metres": round(self.metres, 2),
+            "odometer": self.odometer.parameters(),
+            "places": {name: [round(x, 4), round(y, 4)] for name, (x, y) in places.items()},
+            "visits": visits,
+            **more,
+            "scans": list(scans),
+            "poses": self.poses.round(4).tolist(),
+        }
+        return replace(self, truth=truth)
+
+
+@dataclass
+class Recorder:
+    """Notes the pose of a robot after each of its motions, and that a scan is due where it has moved far enough since the last one.
+
+    every   metres after which a scan is taken
+    turn    radians after which a scan is taken
+    poses   after each motion
+    scans   for each arrangement of the world in which the robot drove, the numbers of the poses at which scans are taken
+    metres  driven so far
+    """
+
+    every: float = EVERY
+    turn: float = math.radians(10)
+    poses: list[Pose] = field(default_factory=list)
+    scans: list[tuple[World, list[int]]] = field(default_factory=list)
+    metres: float = 0.0
+    _seconds: list[float] = field(default_factory=list)  # for each pose
+    _way: float = 0.0  # since the last scan
+    _turned: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not is_finite(self.every) or self.every <= 0:
+            raise SimulatorError(f"every: expected a number of metres above 0, got {brief(self.every)}; a scan each {EVERY} m is usual")
+
+    @property
+    def taken(self) -> int:
+        """How many scans have been taken."""
+        return sum(len(numbers) for _, numbers in self.scans)
+
+    def note(self, world: World, pose: Pose) -> None:
+        """Note where the robot is after a motion, and in which arrangement of the world. In a long motion scans are taken on its way."""
+        if not self.poses:
+            self._add(world, pose, 0.0, 0.0)
+            return
+        start = self.poses[-1]
+        dx, dy, turned = between(start, pose)
+        way = math.hypot(dx, dy)
+        parts = max(math.ceil(FINE * max(way / self.every, abs(turned) / self.turn)), 1)
+        for part in range(1, parts):
+            self._add(world, moved(start, (dx * part / parts, dy * part / parts, turned * part / parts)), way / parts, abs(turned) / parts)
+        self._add(world, pose, way / parts, abs(turned) / parts)
+
+    def _add(self, world: World, pose: Pose, way: float, turned: float) -> None:
+        self.metres += way
+        self._seconds.append((self._seconds[-1] if self._seconds else 0.0) + way / SPEED + turned / SPIN)
+        self._way, self._turned = self._way + way, self._turned + turned
+        self.poses.append(pose)
+        if not self.scans or self.scans[-1][0] is not world:
+            self.scans.append((world, []))
+        if len(self.poses) == 1 or self._way >= self.every - TINY or self._turned >= self.turn - TINY:
+            self.scans[-1][1].append(len(self.poses) - 1)
+            self._way = self._turned = 0.0
+
+    def drive(self, name: str, laser: Laser, odometer: Odometer, seed: int) -> Drive:
+        """The drive that has been noted. The noise of scans and odometer has numbers of its own, so that it does not change where the robot goes."""
+        sight, wheels = (np.random.default_rng([seed, k]) for k in (2, 3))
+        poses = np.array(self.poses)
+        numbers = [number for _, part in self.scans for number in part]
+        ranges = np.vstack([laser.scan(world, poses[part], sight) for world, part in self.scans if part])
+        return Drive(
+            name=name,
+            ranges=np.where(ranges < laser.reach, ranges, np.inf),
+            odometry=odometer.reading(poses, wheels)[numbers],
+            poses=poses[numbers],
+            times=np.array(self._seconds)[numbers],
+            metres=self.metres,
+            odometer=odometer,
+            laser=laser,
+        )
