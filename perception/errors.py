@@ -11,6 +11,10 @@ class PerceptionError(SSHError, ValueError):
     """Images, labels, settings or a stored recogniser are not what was asked for. A ValueError too, as scikit-learn expects."""
 
 
+class LogError(SSHError, ValueError):
+    """A robot's log, or what it holds, cannot be read or written. The text says what was expected, what came, and how to mend it."""
+
+
 class ImageWarning(UserWarning):
     """Images were poor, but could be used. The text says how much of them was replaced, or what was assumed."""
 

@@ -13,26 +13,12 @@ import math
 
 import numpy as np
 
-from ssh_abduction.odometry import Displacement, Odometry
+from ssh_abduction.odometry import Displacement, Odometry, Pose, between, moved
 
-Pose = tuple[float, float, float]
+__all__ = ["DIGITS", "Pose", "between", "moved", "reported"]
+
 # What is reported is rounded to so many digits after the point, as in a log.
 DIGITS = 5
-
-
-def moved(pose: Pose, displacement: Displacement) -> Pose:
-    """The pose, (x, y, heading), after a displacement in the frame of a pose; metres and radians."""
-    x, y, heading = pose
-    dx, dy, turned = displacement
-    cos, sin = math.cos(heading), math.sin(heading)
-    return x + cos * dx - sin * dy, y + sin * dx + cos * dy, math.remainder(heading + turned, math.tau)
-
-
-def between(start: Pose, end: Pose) -> Displacement:
-    """The displacement that leads from one pose to another, in the frame of the first. It turns by at most half a turn."""
-    dx, dy = end[0] - start[0], end[1] - start[1]
-    cos, sin = math.cos(start[2]), math.sin(start[2])
-    return cos * dx + sin * dy, cos * dy - sin * dx, math.remainder(end[2] - start[2], math.tau)
 
 
 def reported(

@@ -17,6 +17,7 @@ from typing import Any, TypeAlias
 
 from ssh_abduction.errors import TraceError, brief, is_finite
 
+Pose: TypeAlias = tuple[float, float, float]
 Displacement: TypeAlias = tuple[float, float, float]
 Covariance: TypeAlias = tuple[Displacement, Displacement, Displacement]
 
@@ -129,6 +130,21 @@ def checked_covariance(value: Any, where: str) -> Covariance:
             f"{where}: expected a positive definite matrix, got {brief(value)}; give variances above 0, in square metres and square radians"
         )
     return (a, b, c), (b, e, f), (c, f, k)
+
+
+def moved(pose: Pose, displacement: Displacement) -> Pose:
+    """The pose, (x, y, heading), after a displacement in the frame of a pose; metres and radians."""
+    x, y, heading = pose
+    dx, dy, turned = displacement
+    cos, sin = math.cos(heading), math.sin(heading)
+    return x + cos * dx - sin * dy, y + sin * dx + cos * dy, math.remainder(heading + turned, math.tau)
+
+
+def between(start: Pose, end: Pose) -> Displacement:
+    """The displacement that leads from one pose to another, in the frame of the first. It turns by at most half a turn."""
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    cos, sin = math.cos(start[2]), math.sin(start[2])
+    return cos * dx + sin * dy, cos * dy - sin * dx, math.remainder(end[2] - start[2], math.tau)
 
 
 def in_words(displacement: Displacement) -> str:

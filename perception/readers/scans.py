@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-Pose: TypeAlias = tuple[float, float, float]
+from ssh_abduction.odometry import Pose
+
+__all__ = ["Damage", "Laser", "Pose", "RobotLog", "Scan"]
 
 
 @dataclass(frozen=True)
