@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from ssh_abduction.engines.base import Cost
     from ssh_abduction.errors import LocaliserError, MapError, RangeError, SolverError, SSHError, TheoryError, TraceError
-    from ssh_abduction.evaluation import Evaluation, MapEvaluation, evaluate
+    from ssh_abduction.evaluation import Evaluation, MapEvaluation, VisitsEvaluation, evaluate, evaluate_visits
     from ssh_abduction.explorer import Exploration, Explorer
     from ssh_abduction.export.formats import export_map
     from ssh_abduction.localize import Belief, Chances, Localiser
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
     "errors": ("LocaliserError", "MapError", "RangeError", "SSHError", "SolverError", "TheoryError", "TraceError"),
-    "evaluation": ("Evaluation", "MapEvaluation", "evaluate"),
+    "evaluation": ("Evaluation", "MapEvaluation", "VisitsEvaluation", "evaluate", "evaluate_visits"),
     "export.formats": ("export_map",),
     "explorer": ("Exploration", "Explorer"),
     "localize": ("Belief", "Chances", "Localiser"),
@@ -106,9 +106,11 @@ __all__ = [
     "TheoryError",
     "Trace",
     "TraceError",
+    "VisitsEvaluation",
     "compare",
     "difference",
     "evaluate",
+    "evaluate_visits",
     "export_map",
     "ladder",
     "next_experiment",

@@ -13,9 +13,10 @@ from ssh_abduction.maps import maps_of
 from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
-    from ssh_abduction.evaluation import Evaluation, MapEvaluation
+    from ssh_abduction.evaluation import Evaluation, MapEvaluation, MapPairs, VisitsEvaluation
 
 UNKNOWN = "–"
+PAIRS = ("map", "places", "joined", "right", "precision", "recall", "dstates", "joined", "right", "precision", "recall")
 HEAD = ("map", "isomorphic", "dstates", "places", "paths", "accuracy", "same place", "edges", "links")
 
 
@@ -24,33 +25,75 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser("evaluate", help="how right are these maps?", description=text)
     parser.add_argument("maps", help="what solve --json printed for this trace, or one saved map; - for standard input")
     parser.add_argument("trace", help="trace file (JSON Lines) with truth")
+    parser.add_argument(
+        "--near", type=float, metavar="METRES", help="judge by poses, too, and take poses so near each other for one place (default: 2)"
+    )
+    parser.add_argument(
+        "--relations", metavar="FILE", help="judge by hand-checked relative poses, too: lines of time1 time2 x y z roll pitch yaw"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
     parser.epilog = (
-        "Of pairs at the same place, edges and links, the two shares are precision and recall. docs/formats.md says what they are."
+        "Of pairs at the same place, edges and links, the two shares are precision and recall. Where steps tell poses and no names, as those "
+        "of an imported log do, visits near each other are judged. docs/formats.md says what is counted."
     )
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.evaluation import evaluate  # which loads scipy
+    from ssh_abduction.evaluation import Relations, evaluate, evaluate_visits, tells_names, told_poses  # which load scipy
+    from ssh_abduction.evaluation.visits import NEAR
 
     data = read_maps(options.maps)
     maps = maps_of(data, str(options.maps))
     if not maps:
         raise MapError(f"{options.maps}: maps: expected one to evaluate, got none; see the status that solve printed")
     trace = Trace.load(options.trace)
+    relations = None if options.relations is None else Relations.load(options.relations)
+    near = NEAR if options.near is None else options.near
+    named_truth = tells_names(trace)
+    found, judged = None, []
     try:
-        found = evaluate(maps, trace)
+        if options.near is not None or (not named_truth and any(told_poses(trace))):
+            judged.append(evaluate_visits(maps, trace, near=near))
+        if relations is not None:
+            judged.append(evaluate_visits(maps, trace, near=near, relations=relations))
+        if named_truth or not judged:
+            found = evaluate(maps, trace)
     except MapError as error:
         raise MapError(f"{named(options.maps)}: {error}") from None
     if options.json:
-        print(json_line(found.to_dict()))
+        told = {"count": len(maps)} if found is None else found.to_dict()
+        print(json_line({**told, **{visits.judge: visits.to_dict() for visits in judged}}))
         return 0
-    may_be_more = isinstance(data, dict) and data.get("complete") is False
-    print(_headline(found, may_be_more))
-    print(_truth(found, len(trace)))
-    print(table(HEAD, [_row(i, one) for i, one in enumerate(found.maps, 1)]))
+    if found is not None:
+        may_be_more = isinstance(data, dict) and data.get("complete") is False
+        print(_headline(found, may_be_more))
+        print(_truth(found, len(trace)))
+        print(table(HEAD, [_row(i, one) for i, one in enumerate(found.maps, 1)]))
+    for visits in judged:
+        print(_told_of_visits(visits))
+        print(table(PAIRS, [[i, *_pairs(one.places), *_pairs(one.dstates)] for i, one in enumerate(visits.maps, 1)]))
     return 0
+
+
+def _told_of_visits(found: VisitsEvaluation) -> str:
+    places, dstates = found.places, found.dstates
+    left_out = [
+        counted(places.stayed, "pairs") + " within that, as the robot was at no visit farther away in between" if places.stayed else "",
+        counted(places.unknown, "pairs") + f", as {found.judge} do not tell how far apart they are" if places.unknown else "",
+    ]
+    return (
+        f"judged by {found.judge}: of {counted(places.judged, 'pairs')} of different visits {places.returns} are returns to one place: within "
+        f"{found.near:g} m, and the robot was farther away in between; of {counted(dstates.judged, 'pairs')} of their steps {dstates.returns} are returns "
+        f"to one dstate: headings differ by at most {found.turned:g} degrees, too"
+        + "".join(f"\nleft out: {text}" for text in left_out if text)
+    )
+
+
+def _pairs(pairs: MapPairs | None) -> list[object]:
+    if pairs is None:
+        return [UNKNOWN] * 5
+    return [pairs.things, pairs.joined, pairs.right, _share(pairs.precision), _share(pairs.recall)]
 
 
 def _headline(found: Evaluation, may_be_more: bool) -> str:

@@ -121,13 +121,18 @@ def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
     """
     truth = _Truth(checked_trace(trace))
     return Evaluation(
-        maps=tuple(_evaluated(_checked(ssh_map, f"maps[{i}]", trace), truth) for i, ssh_map in enumerate(maps)),
+        maps=tuple(_evaluated(checked_map(ssh_map, f"maps[{i}]", trace), truth) for i, ssh_map in enumerate(maps)),
         steps=sum(any(told) for told in zip(truth.dstates, truth.places, truth.paths, strict=True)),
         true_dstates=_different(truth.dstates),
         true_places=_different(truth.places),
         true_paths=_different(truth.paths),
         ambiguity=_ambiguity(trace.views, truth.dstates),
     )
+
+
+def tells_names(trace: Trace) -> bool:
+    """Whether the truth of some step names a dstate, a place or a path. Raises TraceError for what cannot be a name."""
+    return any(name for t, step in enumerate(trace.steps) for name in _told(step.truth, trace.at(t)).values())
 
 
 class _Truth:
@@ -140,7 +145,7 @@ class _Truth:
         if not any((*self.dstates, *self.places, *self.paths)):
             raise TraceError(
                 f"{named(trace.source or 'trace')}: truth: expected the true dstate or place of some step, got none; "
-                f'write "truth": {{"dstate": …, "place": …}} on the steps'
+                f'write "truth": {{"dstate": …, "place": …}} on the steps, or {{"pose": [x, y, heading]}}'
             )
         first: dict[Hashable, dict[str, tuple[int, Hashable]]] = {}
         for t, step in enumerate(told):
@@ -190,7 +195,7 @@ def _hops(names: Sequence[Hashable]) -> list[int]:
     return [t for t in range(len(names) - 1) if names[t] is not None and names[t + 1] is not None]
 
 
-def _checked(ssh_map: object, where: str, trace: Trace) -> SSHMap:
+def checked_map(ssh_map: object, where: str, trace: Trace) -> SSHMap:
     """A map that has a label for each step of the trace. Raises MapError."""
     if not isinstance(ssh_map, SSHMap):
         raise MapError(f"{where}: expected an SSHMap, got {brief(ssh_map)}; take the maps of a solution, or SSHMap.load")

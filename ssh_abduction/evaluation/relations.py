@@ -1,0 +1,151 @@
+"""Hand-checked relative poses between the scans of a log, as an independent judge of whether two moments were at one place.
+
+A file of relations (Kümmerle et al. 2009, "On measuring the accuracy of SLAM algorithms") has a line for each: two times, and where the robot was at the second
+one, as seen from where it was at the first: time1 time2 x y z roll pitch yaw, in seconds, metres and radians.
+
+>>> from ssh_abduction.evaluation.relations import Relation, Relations
+>>> quarter = 1.5707963
+>>> around = Relations([Relation(t, t + 1.0, (4.0, 0.0, quarter)) for t in range(3)])
+>>> seen = around.between([0.0, 1.5, 3.0], 0)
+>>> [(round(dx, 1), round(dy, 1), round(way)) for (dx, dy, _), way in seen]
+[(0.0, 0.0, 0), (4.0, 2.0, 6), (0.0, 4.0, 12)]
+
+The relations are a graph: its nodes are times, and relations are followed either way. A moment between two times that a relation joins is on the way from the one
+to the other. From one moment to another, relations are composed along the shortest way, and the longer that way is, the less the result is worth.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from simulator.motion import Pose, between, moved
+from ssh_abduction.errors import TraceError, brief, named
+from ssh_abduction.files import read_at_most
+from ssh_abduction.odometry import Displacement
+
+# A file of more bytes than this holds something else.
+LARGEST = 2**28
+FIELDS = ("time1", "time2", "x", "y", "z", "roll", "pitch", "yaw")
+# A moment that is not between two related times may be so many seconds from one: robots that map buildings drive at most a metre a second.
+NEAREST = 0.5
+# Each relation counts as so many metres more than it is long, as a relation between two near poses has an error, too.
+EACH = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Relation:
+    """Where the robot was at the second time, as seen from where it was at the first: x ahead, y to the left, and turned counterclockwise."""
+
+    first: float
+    second: float
+    displacement: Displacement
+
+
+class Relations:
+    """Relations as a graph of times, which can be asked where the robot was at one time, as seen from another."""
+
+    def __init__(self, relations: Iterable[Relation]) -> None:
+        """Raises TraceError where there are none."""
+        self._to: dict[tuple[int, int], Displacement] = {}
+        relations = tuple(relations)
+        if not relations:
+            raise TraceError("relations: expected one or more, got none; give a file of relative poses")
+        self.times = sorted({time for relation in relations for time in (relation.first, relation.second)})
+        number = {time: i for i, time in enumerate(self.times)}
+        for relation in relations:
+            a, b = number[relation.first], number[relation.second]
+            self._to[a, b] = relation.displacement
+            self._to[b, a] = between(relation.displacement, (0.0, 0.0, 0.0))
+        ends = np.array(list(self._to)).T
+        metres = [math.hypot(x, y) + EACH for x, y, _ in self._to.values()]
+        self._graph = coo_array((metres, (ends[0], ends[1])), shape=(len(self.times), len(self.times))).tocsr()
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Relations:
+        """Read a file of relations. Raises TraceError that names the line, and OSError."""
+        try:
+            text = read_at_most(path, LARGEST).decode("utf-8")
+        except ValueError as error:  # bytes that are no text are one, too
+            raise TraceError(f"{named(path)}: expected a text of relations, got another file ({error}); give one of numbers") from None
+        found = []
+        for number, line in enumerate(text.splitlines(), 1):
+            fields = line.partition("#")[0].split()
+            if fields:
+                found.append(_relation(fields, f"{named(path)}:{number}"))
+        if not found:
+            raise TraceError(f"{named(path)}: expected lines of {' '.join(FIELDS)}, got none; give a file of relations")
+        return Relations(found)
+
+    def covers(self, time: float | None) -> bool:
+        """Whether a moment has related times around it, or near it."""
+        return self._near(time) is not None
+
+    def between(self, times: Sequence[float | None], origin: int) -> list[tuple[Pose, float] | None]:
+        """For each moment the pose of the robot as seen from where it was at the moment `origin`, and the metres of relations that were composed for it.
+
+        times  of the moments, in seconds; None where a moment has no time
+
+        None where relations do not lead there, or a moment has no related times around it.
+        """
+        moments = [self._near(time) for time in times]
+        start = moments[origin]
+        if start is None:
+            return [None] * len(times)
+        node, offset = start
+        metres, before = dijkstra(self._graph, indices=node, return_predecessors=True)
+        poses: dict[int, Pose] = {node: between(offset, (0.0, 0.0, 0.0))}
+        found: list[tuple[Pose, float] | None] = []
+        for i, moment in enumerate(moments):
+            if moment is None or not math.isfinite(metres[moment[0]]):
+                found.append(None)
+            elif i == origin:
+                found.append(((0.0, 0.0, 0.0), 0.0))
+            else:
+                pose = moved(self._composed(moment[0], before, poses), moment[1])
+                found.append((pose, float(metres[moment[0]]) + math.hypot(*offset[:2]) + math.hypot(*moment[1][:2])))
+        return found
+
+    def _composed(self, node: int, before: Sequence[int], poses: dict[int, Pose]) -> Pose:
+        """The pose at a node: relations composed along the way on which the shortest one leads there. Poses on the way are noted."""
+        way = []
+        while node not in poses:
+            way.append(node)
+            node = int(before[node])
+        for after in reversed(way):
+            poses[after] = moved(poses[node], self._to[node, after])
+            node = after
+        return poses[node]
+
+    def _near(self, time: float | None) -> tuple[int, Displacement] | None:
+        """The node nearest to a moment, and the displacement from there: a share of the relation to the node on the moment's other side."""
+        if time is None:
+            return None
+        after = bisect.bisect_left(self.times, time)
+        around = [i for i in (after - 1, after) if 0 <= i < len(self.times)]
+        node = min(around, key=lambda i: abs(self.times[i] - time))
+        (other,) = [i for i in around if i != node] or [node]
+        if (whole := self._to.get((node, other))) is not None:
+            share = (time - self.times[node]) / (self.times[other] - self.times[node])
+            return node, (share * whole[0], share * whole[1], share * math.remainder(whole[2], math.tau))
+        return (node, (0.0, 0.0, 0.0)) if abs(self.times[node] - time) <= NEAREST else None
+
+
+def _relation(fields: Sequence[str], where: str) -> Relation:
+    """A relation from the fields of its line. Raises TraceError."""
+    try:
+        first, second, x, y, _, _, _, yaw = (float(field) for field in fields)
+    except ValueError:
+        raise TraceError(f"{where}: expected the numbers {' '.join(FIELDS)}, got {brief(' '.join(fields))}; mend the line") from None
+    if not all(math.isfinite(value) for value in (first, second, x, y, yaw)):
+        raise TraceError(f"{where}: expected finite numbers, got {brief(' '.join(fields))}; mend the line")
+    if first == second:
+        raise TraceError(f"{where}: time2: expected another time than time1, got {fields[1]} twice; mend the line")
+    return Relation(first, second, (x, y, yaw))

@@ -1,0 +1,295 @@
+"""How right maps are, where the truth is no name but a pose: are the visits that a map has at one place truly at one place?
+
+>>> from dataclasses import replace
+>>> from ssh_abduction import Theory, Trace, evaluate_visits, solve
+>>> seen = Trace.from_steps("abab", [{"name": "go", "kind": "travel"}] * 3)
+>>> poses = [0, 0, 0], [9, 0, 0], [0.5, 0, 0], [0, 9, 0]
+>>> trace = replace(seen, steps=tuple(replace(step, truth={"pose": pose}) for step, pose in zip(seen.steps, poses)))
+>>> found = evaluate_visits(solve(trace, Theory.causal()).maps, trace)
+>>> found.dstates.judged, found.dstates.returns, found.maps[0].dstates
+(6, 1, MapPairs(things=2, joined=2, right=1, returns=1))
+
+The minimal map rightly has steps 0 and 2 at one dstate, half a metre apart, and wrongly steps 1 and 3. The truth has no names here, as nobody can say where a place ends:
+poses are those at which a robot passed, and two of them are taken for one place if they are near each other.
+
+*What is counted.* A visit is what lies between two travels: the steps that turns join. So steps that follow each other by a turn are one visit, and no pair of visits. Visits
+make pairs for places, and steps of different visits make pairs for dstates. A pair is a true *return* if both are near each other, and if the robot was farther away
+at some visit between: where it merely went on to the next door, it did not return, and yet both may be near each other. Of such a pair nobody can say whether it is one place:
+it is left out, and counted as that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.motion import Pose
+from ssh_abduction.errors import TraceError, brief, is_finite, named
+from ssh_abduction.evaluation.names import checked_map
+from ssh_abduction.evaluation.relations import Relations
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.trace import Trace, checked_trace
+from ssh_abduction.words import counted
+
+# Two poses are one place if they are so near each other, in metres, unless another distance is asked for; and one dstate if their headings differ by at most so many
+# degrees, too: half of a right angle, which tells the directions of a corridor apart, and lets a robot swerve.
+NEAR, TURNED = 2.0, 45.0
+# A distance by composed relations is in doubt by so many metres, and by such a share of the way along which they were composed: so far those of Freiburg and its
+# corrected poses differ, at 998 of 1,000 pairs of scans.
+DOUBT, DOUBT_OF_WAY = 0.2, 0.01
+
+Array: TypeAlias = NDArray[np.float64]
+Steps: TypeAlias = NDArray[np.int_]
+Verdicts: TypeAlias = NDArray[np.uint8]
+# What is true of a pair: nobody knows; it is not one; it is one; or it is near, but the robot was not away in between.
+UNKNOWN, APART, RETURN, STAYED = range(4)
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Pairs that are judged, whatever a map says of them.
+
+    judged    pairs of which it is known whether they are one place (or one dstate)
+    returns   those that are
+    stayed    pairs near each other that are left out, as the robot was at no visit farther away in between
+    unknown   pairs that are left out, as the truth does not tell how far apart they are
+    """
+
+    judged: int
+    returns: int
+    stayed: int
+    unknown: int
+
+
+@dataclass(frozen=True, slots=True)
+class MapPairs:
+    """What a map says of the pairs that are judged.
+
+    things   how many places (or dstates) the map has at the steps of the trace
+    joined   how many of the judged pairs it has at one place (or dstate)
+    right    how many of these truly are
+    returns  how many of the judged pairs truly are, whether joined or not
+    """
+
+    things: int
+    joined: int
+    right: int
+    returns: int
+
+    @property
+    def precision(self) -> float | None:
+        """Of the pairs that the map joins, the share that truly is one; None where it joins none."""
+        return self.right / self.joined if self.joined else None
+
+    @property
+    def recall(self) -> float | None:
+        """Of the pairs that truly are one, the share that the map joins; None where there are none."""
+        return self.right / self.returns if self.returns else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The counts, precision and recall under their names."""
+        return {"things": self.things, "joined": self.joined, "right": self.right, "precision": self.precision, "recall": self.recall}
+
+
+@dataclass(frozen=True, slots=True)
+class MapVisits:
+    """How right one map is, by pairs. `places` is None where the map has none, as maps of causal theories have."""
+
+    places: MapPairs | None
+    dstates: MapPairs
+
+
+@dataclass(frozen=True, slots=True)
+class VisitsEvaluation:
+    """How right maps of one trace are, judged by poses.
+
+    judge    what tells the truth: "poses" of the trace, or "relations"
+    near     metres within which two poses are one place
+    turned   degrees by which the headings of one dstate differ at most
+    visits   how many the trace has
+    places, dstates  the pairs of visits, and of steps of different visits
+    maps     each map, in the order given
+    """
+
+    judge: str
+    near: float
+    turned: float
+    visits: int
+    places: Pairs
+    dstates: Pairs
+    maps: tuple[MapVisits, ...]
+
+    def __repr__(self) -> str:
+        told = f"{counted(self.visits, 'visits')}, {counted(self.places.returns, 'returns')} by {self.judge}"
+        return f"<VisitsEvaluation: {counted(len(self.maps), 'maps')} of {told}>"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The values under their names, as `evaluate --json` prints them, with the precision and recall of each map."""
+        own = {
+            "near": self.near,
+            "turned": self.turned,
+            "visits": self.visits,
+            "places": asdict(self.places),
+            "dstates": asdict(self.dstates),
+        }
+        maps = [{"places": found.places and found.places.to_dict(), "dstates": found.dstates.to_dict()} for found in self.maps]
+        return {**own, "maps": maps}
+
+
+def evaluate_visits(
+    maps: Iterable[SSHMap], trace: Trace, *, near: float = NEAR, turned: float = TURNED, relations: Relations | None = None
+) -> VisitsEvaluation:
+    """How right these maps of a trace are: precision and recall of the pairs of visits, and of steps, that they have at one place, and at one dstate.
+
+    near, turned  what counts as one place, in metres, and as one dstate, in degrees
+    relations     judge by them, at the `time` of the steps, and not by the poses of the trace
+
+    Raises TraceError where no step has a pose, or with relations a time, or one is malformed; MapError for a map of other steps.
+    """
+    checked_trace(trace)
+    for name, value in (("near", near), ("turned", turned)):
+        if not is_finite(value) or value <= 0:
+            raise TraceError(
+                f"{name}: expected a number above 0, got {brief(value)}; say what counts as one {'place' if name == 'near' else 'dstate'}"
+            )
+    truth: _Poses | _Related = _Poses(trace) if relations is None else _Related(trace, relations)
+    visit = np.cumsum([0, *(action.kind != "turn" for action in trace.actions)])
+    places, dstates = _verdicts(truth, visit, near, turned)
+    return VisitsEvaluation(
+        judge=truth.name,
+        near=float(near),
+        turned=float(turned),
+        visits=len(places),
+        places=_pairs(places, np.arange(len(places))),
+        dstates=_pairs(dstates, visit),
+        maps=tuple(_evaluated(checked_map(ssh_map, f"maps[{i}]", trace), visit, places, dstates) for i, ssh_map in enumerate(maps)),
+    )
+
+
+def told_poses(trace: Trace) -> list[Pose | None]:
+    """The true pose of each step, (x, y, heading) in metres and radians; None where it is not told. Raises TraceError for one that is malformed."""
+    poses: list[Pose | None] = []
+    for t, step in enumerate(trace.steps):
+        value = step.truth.get("pose") if isinstance(step.truth, Mapping) else None
+        if value is None:
+            poses.append(None)
+        elif isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 3 and all(is_finite(number) for number in value):
+            poses.append((float(value[0]), float(value[1]), float(value[2])))
+        else:
+            raise TraceError(f"{trace.at(t)}: truth.pose: expected [x, y, heading] in metres and radians, got {brief(value)}; mend it")
+    return poses
+
+
+class _Poses:
+    """The poses of a trace as judges."""
+
+    name = "poses"
+
+    def __init__(self, trace: Trace) -> None:
+        poses = told_poses(trace)
+        self.told = np.array([pose is not None for pose in poses])
+        if not self.told.any():
+            raise TraceError(
+                f'{named(trace.source or "trace")}: truth.pose: expected the true pose of some step, got none; write "truth": {{"pose": [x, y, heading]}} '
+                f"on the steps, as import does where a log has corrected poses"
+            )
+        self._poses = np.array([(math.nan,) * 3 if pose is None else pose for pose in poses])
+
+    def seen_from(self, step: int) -> tuple[Array, Array, Array]:
+        """How far each step is from this one, in metres; how far its heading is turned from this one's, in degrees; and the doubt of the distance. NaN: not known."""
+        dx, dy, turned = (self._poses - self._poses[step]).T
+        return np.hypot(dx, dy), _degrees(turned), np.zeros(len(dx))
+
+
+class _Related:
+    """Relative poses of the times of a trace as judges."""
+
+    name = "relations"
+
+    def __init__(self, trace: Trace, relations: Relations) -> None:
+        self._relations = relations
+        self._times = [_time(step.extra.get("time"), trace.at(t)) for t, step in enumerate(trace.steps)]
+        self.told = np.array([relations.covers(time) for time in self._times])
+        if not self.told.any():
+            began, ended = relations.times[0], relations.times[-1]
+            raise TraceError(
+                f"{named(trace.source or 'trace')}: time: expected steps at times that are related, from {began:g} to {ended:g} s, got none; "
+                f"import the trace from the log that the relations are of"
+            )
+
+    def seen_from(self, step: int) -> tuple[Array, Array, Array]:
+        """The same, by relations."""
+        seen = self._relations.between(self._times, step)
+        dx, dy, turned, way = np.array([(math.nan,) * 4 if one is None else (*one[0], one[1]) for one in seen]).T
+        return np.hypot(dx, dy), _degrees(turned), DOUBT + DOUBT_OF_WAY * way
+
+
+def _time(value: Any, where: str) -> float | None:
+    """The time of a step in seconds. Raises TraceError."""
+    if value is not None and not is_finite(value):
+        raise TraceError(f"{where}: time: expected seconds, got {brief(value)}; mend it, or leave it out")
+    return None if value is None else float(value)
+
+
+def _degrees(radians: Array) -> Array:
+    """Turns without their side, from 0 to 180 degrees."""
+    return np.abs(np.degrees((radians + math.pi) % math.tau - math.pi))
+
+
+def _verdicts(truth: _Poses | _Related, visit: Steps, near: float, turned: float) -> tuple[Verdicts, Verdicts]:
+    """What is true of each pair of visits, and of each pair of steps, the earlier one first. UNKNOWN where a pair is none.
+
+    visit  of each step, counted from 0
+    """
+    steps = np.arange(len(visit))
+    # A visit is where the first of its steps is whose pose is known.
+    at = np.array([min(steps[visit == v], key=lambda t: not truth.told[t]) for v in range(visit[-1] + 1)])
+    places = np.full((len(at), len(at)), UNKNOWN, np.uint8)
+    dstates = np.full((len(visit), len(visit)), UNKNOWN, np.uint8)
+    for v, first in enumerate(at):
+        distance, _, doubt = truth.seen_from(first)
+        far, unknown = distance[at] > near, ~(np.abs(distance[at] - near) >= doubt[at])
+        left = np.cumsum((far & ~unknown)[v:-1]) > 0  # for each later visit, whether the robot was away at one before
+        places[v, v + 1 :] = np.where(unknown, UNKNOWN, np.where(far, APART, STAYED))[v + 1 :]
+        places[v, v + 1 :][left & (places[v, v + 1 :] == STAYED)] = RETURN
+        later = visit > v
+        for step in steps[visit == v]:
+            distance, heading, doubt = (told[later] for told in truth.seen_from(step))
+            far, unknown = distance > near, ~(np.abs(distance - near) >= doubt)
+            returned = np.where(left[visit[later] - v - 1], np.where(heading <= turned, RETURN, APART), STAYED)
+            dstates[step, later] = np.where(unknown, UNKNOWN, np.where(far, APART, returned))
+    return places, dstates
+
+
+def _pairs(verdicts: Verdicts, visit: Steps) -> Pairs:
+    """How many pairs there are of each verdict. Of one visit there are none.
+
+    visit  of each row
+    """
+    told = Counter(verdicts[visit[:, None] < visit].tolist())
+    return Pairs(told[APART] + told[RETURN], told[RETURN], told[STAYED], told[UNKNOWN])
+
+
+def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdicts) -> MapVisits:
+    at = [ssh_map.dstates[label] for label in ssh_map.labels]
+    one = np.equal.outer(*[[s.id for s in at]] * 2)
+    if not ssh_map.places:
+        return MapVisits(None, _joined(one, dstates, len(ssh_map.dstates)))
+    own = np.array([math.nan if s.place is None else s.place for s in at])  # which is not equal to itself
+    starts = np.flatnonzero(np.diff(visit, prepend=-1))
+    together = np.logical_or.reduceat(np.logical_or.reduceat(np.equal.outer(own, own), starts, axis=0), starts, axis=1)
+    return MapVisits(_joined(together, places, len(ssh_map.places)), _joined(one, dstates, len(ssh_map.dstates)))
+
+
+def _joined(one: NDArray[np.bool_], verdicts: Verdicts, things: int) -> MapPairs:
+    """
+    one  of each pair, whether the map has it as one; pairs that are none are UNKNOWN, so that they do not count
+    """
+    right = int((one & (verdicts == RETURN)).sum())
+    return MapPairs(things, right + int((one & (verdicts == APART)).sum()), right, int((verdicts == RETURN).sum()))
