@@ -1,0 +1,208 @@
+"""Scans with odometry, as a simulated robot takes them, written as logs of the kinds that real robots write.
+
+>>> import math, tempfile
+>>> import numpy as np
+>>> from perception.readers.logs import read_log
+>>> from perception.readers.scans import Laser, Scan
+>>> from perception.readers.writers import write_carmen
+>>> laser = Laser(first=-math.pi / 2, step=math.pi / 2, beams=3, reach=8.0)
+>>> scan = Scan(np.array([1.0, np.inf, 2.5]), laser, odometry=(1.0, 0.0, 0.0), corrected=(1.1, 0.0, 0.0), time=0.5)
+>>> with tempfile.TemporaryDirectory() as folder:
+...     write_carmen(f"{folder}/drive.log", [scan])
+...     read = read_log(f"{folder}/drive.log").scans[0]
+>>> read.ranges.tolist(), read.odometry, read.corrected
+([1.0, inf, 2.5], (1.0, 0.0, 0.0), (1.1, 0.0, 0.0))
+
+Lengths are metres and angles radians, in all formats. The true pose, a scan's `corrected`, is written where the format has a place for it that no reader takes for odometry.
+A scan without a time gets its index as one, in seconds.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.errors import LogError
+from perception.readers.scans import Laser, Scan
+from ssh_abduction.errors import named
+from ssh_abduction.files import write_file
+from ssh_abduction.odometry import Pose, between, moved
+
+HEADER = (
+    "# message formats defined: PARAM ODOM TRUEPOS ROBOTLASER1\n"
+    "# ODOM x y theta tv rv accel timestamp hostname logger_timestamp\n"
+    "# TRUEPOS true_x true_y true_theta odom_x odom_y odom_theta timestamp hostname logger_timestamp\n"
+    "# ROBOTLASER1 type start fov step reach accuracy remission n ranges 0 laser_pose robot_pose tv rv forward side axis timestamp hostname logger_timestamp\n"
+)
+# The frames of a bag, by the names that REP 105 gives them.
+MAP, ODOM, BASE, LASER = "map", "odom", "base_link", "laser"
+NANO = 1_000_000_000
+
+
+def write_carmen(path: str | os.PathLike[str], scans: Iterable[Scan]) -> None:
+    """Write scans as a log of CARMEN, gzipped where the file's name ends in .gz. The file appears whole or not at all.
+
+    A scan is a line ROBOTLASER1, which says how the laser is made and mounted, behind a line ODOM and, where its true pose is known, a line TRUEPOS, as CARMEN's simulator writes.
+    Ranges beyond the laser's reach are written as its reach, those that are no measurement as 0. Raises LogError.
+    """
+    text = HEADER + "".join(map(_carmen_lines, *_numbered(scans)))
+    data = text.encode("ascii")
+    try:
+        write_file(path, gzip.compress(data, mtime=0) if os.fspath(path).endswith(".gz") else data)
+    except (OSError, ValueError) as error:
+        raise LogError(
+            f"{named(path)}: expected a file that can be written: {getattr(error, 'strerror', None) or error}; check the path"
+        ) from None
+
+
+def write_bag(path: str | os.PathLike[str], scans: Iterable[Scan]) -> None:
+    """Write scans as a ROS bag: a file of ROS 1 where the name ends in .bag, a file of MCAP where it ends in .mcap, else a folder of ROS 2. What is written appears whole or not at all.
+
+    Topics: /scan (LaserScan), /odom (Odometry), /tf (from odom to base_link and, where the true poses are known, from map to odom) and /tf_static (from base_link to laser).
+    Raises LogError, also for a folder that is there already, and where the extra `ros` is missing.
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise LogError(f"{named(path)}: expected a folder that is not there yet, got one that is; name another, or remove it")
+    try:
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".bag-") as draft:
+            written = _write_bag(Path(draft) / target.name, scans)
+            if target.is_file() and written.is_dir():
+                raise LogError(
+                    f"{named(path)}: expected the name of a folder, got that of a file; name another, or end it in .bag or .mcap"
+                )
+            shutil.move(written, target)
+    except OSError as error:
+        raise LogError(f"{named(path)}: expected a bag that can be written: {error.strerror or error}; check the path") from None
+
+
+def _numbered(scans: Iterable[Scan]) -> tuple[list[Scan], list[float]]:
+    """The scans, and the time of each. Raises LogError where there are none."""
+    listed = list(scans)
+    if not listed:
+        raise LogError("scans: expected at least one to write, got none")
+    return listed, [float(i) if scan.time is None else scan.time for i, scan in enumerate(listed)]
+
+
+def _carmen_lines(scan: Scan, time: float) -> str:
+    """The lines of a scan."""
+    stamp = f"{time:.6f} localhost {time:.6f}\n"
+    odometry = _numbers(scan.odometry)
+    laser = scan.laser
+    reach = laser.reach if math.isfinite(laser.reach) else float(np.max(scan.ranges, where=np.isfinite(scan.ranges), initial=0.0)) + 1.0
+    ranges = " ".join(f"{r:.4f}" for r in np.nan_to_num(np.minimum(scan.ranges, reach), nan=0.0))
+    shape = f"{laser.first:.9f} {laser.step * laser.beams:.9f} {laser.step:.9f} {reach:.4f} 0.01 0"
+    truth = f"TRUEPOS {_numbers(scan.corrected)} {odometry} {stamp}" if scan.corrected is not None else ""
+    return (
+        f"{truth}ODOM {odometry} 0 0 0 {stamp}"
+        f"ROBOTLASER1 0 {shape} {laser.beams} {ranges} 0 {_numbers(moved(scan.odometry, laser.mount))} {odometry} 0 0 0 0 0 {stamp}"
+    )
+
+
+def _numbers(pose: Pose) -> str:
+    return " ".join(f"{value:.6f}" for value in pose)
+
+
+def _write_bag(path: Path, scans: Iterable[Scan]) -> Path:
+    """Write a bag, and say which file or folder of it is to be kept."""
+    try:
+        from rosbags import rosbag1, rosbag2
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError:
+        raise LogError("bag: expected the package rosbags, got none; pip install 'ssh-abduction[ros]'") from None
+    is_ros1 = path.suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    transforms = "tf2_msgs/msg/TFMessage"
+    if transforms not in store.fielddefs:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", transforms))
+    kinds = {"/scan": "sensor_msgs/msg/LaserScan", "/odom": "nav_msgs/msg/Odometry", "/tf": transforms, "/tf_static": transforms}
+    plugin = rosbag2.StoragePlugin.MCAP if path.suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
+    writer: Any = rosbag1.Writer(path) if is_ros1 else rosbag2.Writer(path, version=8, storage_plugin=plugin)
+    serialize = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+    with writer:
+        topics = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
+        for topic, time, message in _messages(store, scans, is_ros1):
+            writer.write(topics[topic], time, serialize(message, kinds[topic]))
+    return next(path.glob("*.mcap")) if path.suffix == ".mcap" else path
+
+
+def _messages(store: Any, scans: Iterable[Scan], is_ros1: bool) -> Iterator[tuple[str, int, Any]]:
+    """The messages of all scans: topic, time in nanoseconds, and message."""
+    types = store.types
+    mounted: set[Pose] = set()
+    for number, (scan, seconds) in enumerate(zip(*_numbered(scans), strict=True)):
+        time = round(seconds * NANO)
+        if time < 0:
+            raise LogError(f"scan {number}: expected a time from 0 on, as bags count it, got {seconds:g}; shift the times")
+        make = _Maker(
+            types, types["builtin_interfaces/msg/Time"](sec=time // NANO, nanosec=time % NANO), {"seq": number} if is_ros1 else {}
+        )
+        laser = scan.laser
+        if laser.mount not in mounted:
+            if mounted:
+                raise LogError(f"scan {number}: expected one mount of the laser in a bag, got another; write two bags")
+            mounted.add(laser.mount)
+            yield "/tf_static", time, make.transform(BASE, LASER, laser.mount)
+        yield "/tf", time, make.transform(ODOM, BASE, scan.odometry)
+        if scan.corrected is not None:
+            yield "/tf", time, make.transform(MAP, ODOM, moved(scan.corrected, between(scan.odometry, (0.0, 0.0, 0.0))))
+        yield "/odom", time, make.odometry(scan.odometry)
+        yield "/scan", time, make.scan(scan.ranges, laser)
+
+
+class _Maker:
+    """Makes messages of one time."""
+
+    def __init__(self, types: Any, stamp: Any, numbering: dict[str, int]) -> None:
+        self.types, self.stamp, self.numbering = types, stamp, numbering
+
+    def header(self, frame: str) -> Any:
+        return self.types["std_msgs/msg/Header"](stamp=self.stamp, frame_id=frame, **self.numbering)
+
+    def transform(self, parent: str, child: str, pose: Pose) -> Any:
+        geometry = "geometry_msgs/msg/"
+        move = self.types[geometry + "Transform"](translation=self.vector(pose[0], pose[1]), rotation=self.turned(pose[2]))
+        stamped = self.types[geometry + "TransformStamped"](header=self.header(parent), child_frame_id=child, transform=move)
+        return self.types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
+
+    def odometry(self, pose: Pose) -> Any:
+        geometry, unknown = "geometry_msgs/msg/", np.zeros(36)
+        at = self.types[geometry + "Pose"](
+            position=self.types[geometry + "Point"](x=pose[0], y=pose[1], z=0.0), orientation=self.turned(pose[2])
+        )
+        still = self.types[geometry + "Twist"](linear=self.vector(0.0, 0.0), angular=self.vector(0.0, 0.0))
+        return self.types["nav_msgs/msg/Odometry"](
+            header=self.header(ODOM),
+            child_frame_id=BASE,
+            pose=self.types[geometry + "PoseWithCovariance"](pose=at, covariance=unknown),
+            twist=self.types[geometry + "TwistWithCovariance"](twist=still, covariance=unknown),
+        )
+
+    def scan(self, ranges: NDArray[np.float64], laser: Laser) -> Any:
+        return self.types["sensor_msgs/msg/LaserScan"](
+            header=self.header(LASER),
+            angle_min=laser.first,
+            angle_max=laser.first + laser.step * (laser.beams - 1),
+            angle_increment=laser.step,
+            time_increment=0.0,
+            scan_time=0.0,
+            range_min=0.0,
+            range_max=laser.reach,
+            ranges=np.asarray(ranges, dtype=np.float32),
+            intensities=np.zeros(0, dtype=np.float32),
+        )
+
+    def vector(self, x: float, y: float) -> Any:
+        return self.types["geometry_msgs/msg/Vector3"](x=x, y=y, z=0.0)
+
+    def turned(self, angle: float) -> Any:
+        return self.types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=math.sin(angle / 2), w=math.cos(angle / 2))
