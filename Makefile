@@ -3,13 +3,14 @@
 # make bench-faults  the same of faults: are they found, by ours and by peers; some hours, or ARGS="--seeds 2 --limit 10"
 # make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; an hour, or ARGS="--part growing --seeds 1"
 # make parts  times of single parts: circuits, images, exploring step by step, and small traces
+# make docs   the pages of docs/ and a page for each public name as a site, with its links checked; open site/index.html
 # make test   the same, with the tools of development: lint, types, layers, tests
 PYTHON ?= python3
 BIN := .venv/bin
 export PIP_CONSTRAINT := $(CURDIR)/requirements.lock
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint bench bench-faults bench-grid parts lock clean
+.PHONY: demo test lint docs bench bench-faults bench-grid parts lock clean
 
 demo: .venv/base
 	$(BIN)/python examples/demo.py out
@@ -22,6 +23,10 @@ lint: .venv/dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: .venv/dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -q
+	$(BIN)/python website/check.py site
 
 bench: .venv/bench
 	$(BIN)/python benchmarks/bench.py $(ARGS)
@@ -57,4 +62,4 @@ lock: .venv/dev
 	touch $@
 
 clean:
-	rm -rf .venv out
+	rm -rf .venv out site

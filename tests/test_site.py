@@ -1,0 +1,96 @@
+"""The site of docs/: docstrings are shown as they were meant, links lead somewhere, and nothing is loaded from elsewhere."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import check
+import docstrings
+import hooks
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+FIELDS = """What it is.
+
+id, name  of the thing, or None
+heading   degrees, clockwise
+          from ahead
+All of it may be None.
+
+Parameters
+----------
+maps  of one trace
+
+Raises MapError where  there is none.
+
+>>> 1 + 1
+2"""
+
+
+def test_lists_of_fields_and_examples_keep_their_lines() -> None:
+    assert docstrings.as_markdown(FIELDS).split("\n\n") == [
+        "What it is.",
+        "`id`, `name`\n:   of the thing, or None",
+        "`heading`\n:   degrees, clockwise from ahead",
+        "All of it may be None.",
+        "**Parameters**",
+        "`maps`\n:   of one trace",
+        "Raises MapError where  there is none.",
+        "```pycon\n>>> 1 + 1\n2\n```",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("link", "shown"),
+    [
+        ("../encodings", "https://github.com/ssh-abduction/ssh-abduction/tree/main/encodings"),
+        ("../README.md#try-it", "https://github.com/ssh-abduction/ssh-abduction/blob/main/README.md#try-it"),
+        ("formats.md#maps", "formats.md#maps"),
+    ],
+)
+def test_links_out_of_the_pages_lead_to_github(link: str, shown: str) -> None:
+    assert hooks.to_github(f"See [there]({link}).", "usage.md") == f"See [there]({shown})."
+    assert hooks.to_github("[up](../usage.md)", "tutorials/logs.md") == "[up](../usage.md)"
+
+
+def test_all_names_that_pages_import_have_a_page() -> None:
+    imported = set()
+    for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
+        for text in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
+            found = re.findall(r"^from ((?:ssh_abduction|perception|simulator)\S*) import (.*)$", text, re.MULTILINE)
+            imported |= {f"{module}.{name.strip()}" for module, names in found for name in names.split(",")}
+    themed = {path for paths in hooks.themes().values() for path in paths}
+    ours = {path for path in imported if not any(hooks.named(path) is hooks.named(other) for other in themed)}
+    assert len(imported) > 10
+    assert ours == set()
+
+
+SOUND = '<a id="top" href="#top"></a><a href="b.html#there"></a><link rel="stylesheet" href="s.css"><a href="https://pypi.org/"></a>'
+BROKEN = {
+    '<a href="c.html"></a>': "a.html: links c.html, which is no file of the site",
+    '<a href="b.html#here"></a>': "a.html: links b.html#here, but that page has no such anchor",
+    '<a href="https://github.com/ssh-abduction/ssh-abduction/blob/main/no.lp"></a>': "a.html: links https://github.com/ssh-abduction/ssh-abduction/blob/main/no.lp, "
+    "which is not in the repository",
+    '<script src="https://unpkg.com/x.js"></script>': "a.html: loads https://unpkg.com/x.js from elsewhere",
+    '<link rel="stylesheet" href="//fonts.example/f.css">': "a.html: loads //fonts.example/f.css from elsewhere",
+    '<img src="no.png">': "a.html: loads no.png, which is no file of the site",
+    '<p style="background: url(https://x.example/y.png)"></p>': "a.html: loads https://x.example/y.png from elsewhere",
+}
+
+
+@pytest.mark.parametrize("tag", ["", *BROKEN])
+def test_what_leads_nowhere_or_is_loaded_from_elsewhere_is_found(tag: str, tmp_path: Path) -> None:
+    (tmp_path / "a.html").write_text(SOUND + tag)
+    (tmp_path / "b.html").write_text('<h2 id="there"></h2>')
+    (tmp_path / "s.css").write_text("p { background: url(data:image/png;base64,AA) }")
+    assert list(check.problems(tmp_path)) == ([BROKEN[tag]] if tag else [])
+
+
+def test_style_sheets_that_load_from_elsewhere_are_found(tmp_path: Path) -> None:
+    (tmp_path / "s.css").write_text("@import 'https://x.example/a.css'; p { background: url(\"no.png\") }")
+    assert list(check.problems(tmp_path)) == [
+        "s.css: loads https://x.example/a.css from elsewhere",
+        "s.css: loads no.png, which is no file of the site",
+    ]

@@ -1,0 +1,130 @@
+"""What mkdocs does beside the pages of docs/: the README is the first page, links to files of the repository lead to GitHub, and each public name has a page.
+
+Pages of docs/ are read on GitHub, too, so their links are relative. A link that leaves docs/ leads nowhere on the site; here it becomes one to GitHub.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from collections.abc import Iterator
+from importlib import import_module
+from inspect import getdoc, isclass
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+import ssh_abduction
+
+ROOT = Path(__file__).parent.parent
+GITHUB = "https://github.com/ssh-abduction/ssh-abduction"
+RAW = "https://raw.githubusercontent.com/ssh-abduction/ssh-abduction"
+
+# The public names by theme: all that `ssh_abduction` exports, and what else the pages import, with the module that has it.
+THEMES: dict[str, tuple[str, ...]] = {
+    "From a trace to its maps": ("solve", "Search", "Trace", "Step", "Action", "Odometry", "Theory", "Speedups"),
+    "What an answer says": ("Solution", "Status", "Cost", "Bound", "Certificate", "Level", "Progress", "Backbone"),
+    "Maps": ("SSHMap", "DState", "Path", "Pose", "Fit"),
+    "Rival maps": ("compare", "Comparison", "difference", "Difference", "Listing", "view_page", "Page"),
+    "Why": ("rivals.explain.explain_pair", "rivals.explain.explain_trace", "explain.why_apart", "front.fault_front"),
+    "Is a map right?": ("evaluate", "Evaluation", "MapEvaluation", "ladder", "Rung"),
+    "Using a map": ("route", "Route", "Move", "export_map", "Localiser", "Belief", "Chances"),
+    "While the robot drives": ("OnlineMapper", "next_experiment", "Experiment", "Explorer", "Exploration"),
+    "From images to recognition": ("learner.BootstrapLearner", "perception.views.ViewClusterer", "perception.recognition.recogniser"),
+    "Simulated robots": (
+        "simulator.tours.simulate",
+        "simulator.world.World",
+        "simulator.panorama.Camera",
+        "simulator.panorama.Paint",
+        "simulator.plans.Plan",
+        "simulator.plans.tour",
+    ),
+    "Errors": (
+        "SSHError",
+        "TraceError",
+        "TheoryError",
+        "MapError",
+        "SolverError",
+        "LocaliserError",
+        "RangeError",
+        "perception.errors.PerceptionError",
+        "simulator.errors.SimulatorError",
+    ),
+}
+
+
+def full(name: str) -> str:
+    """Where a name of THEMES is imported from, with it."""
+    return name if name.split(".", maxsplit=1)[0] in ("perception", "simulator") else f"ssh_abduction.{name}"
+
+
+def named(path: str) -> Any:
+    module, _, name = path.rpartition(".")
+    return getattr(import_module(module), name)
+
+
+def page_of(path: str) -> str:
+    """The page of a name, by its path. Functions and classes have folders of their own: `route` and `Route` are one file on some systems."""
+    kind = "classes" if isclass(named(path)) else "functions"
+    return f"reference/{kind}/{path.rpartition('.')[2]}.md"
+
+
+def themes() -> dict[str, tuple[str, ...]]:
+    """Where the names of each theme are imported from, with them. What is exported and has no theme yet comes last."""
+    more = tuple(name for name in ssh_abduction.__all__ if not any(name in names for names in THEMES.values()))
+    return {theme: tuple(map(full, names)) for theme, names in {**THEMES, "More": more}.items() if names}
+
+
+def on_config(config: MkDocsConfig) -> None:
+    (section,) = [item["Reference"] for item in config.nav or [] if "Reference" in item]
+    section.extend({theme: [{path.rpartition(".")[2]: page_of(path)} for path in paths]} for theme, paths in themes().items())
+
+
+def on_files(files: Files, config: MkDocsConfig) -> None:
+    for uri, content in (("index.md", home()), ("reference/index.md", index()), *reference()):
+        files.append(File.generated(config, uri, content=content))
+
+
+def home() -> str:
+    """The README as the first page: what it links on GitHub is here."""
+    text = (ROOT / "README.md").read_text()
+    text = re.sub(rf"{GITHUB}/blob/main/docs/|{RAW}/main/docs/", "", text)
+    return text.replace("# ssh-abduction\n", "---\nhide: [navigation]\n---\n\n# ssh-abduction\n", 1)
+
+
+def index() -> str:
+    lines = ["# Reference", "", "Each public name has a page. What has no module before it is imported from `ssh_abduction`.", ""]
+    for theme, paths in themes().items():
+        lines += [f"## {theme}", ""]
+        for path in paths:
+            shown = path.removeprefix("ssh_abduction.")
+            what = re.split(r"(?<=[.:])\s|\n\n", getdoc(named(path)) or "")[0].replace("\n", " ").rstrip(".:")
+            lines.append(f"[`{shown}`]({posixpath.relpath(page_of(path), 'reference')})\n:   {what}\n")
+    return "\n".join(lines)
+
+
+def reference() -> Iterator[tuple[str, str]]:
+    for paths in themes().values():
+        for path in paths:
+            yield page_of(path), f"::: {path}\n"
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    return to_github(markdown, page.file.src_uri)
+
+
+def to_github(markdown: str, uri: str) -> str:
+    """The text of a page, in which links to files outside docs/ lead to GitHub.
+
+    uri  of the page, from docs/ on
+    """
+
+    def mended(link: re.Match[str]) -> str:
+        target = posixpath.normpath(posixpath.join("docs", posixpath.dirname(uri), link[1]))
+        if target == "docs" or target.startswith("docs/"):
+            return link[0]
+        return f"]({GITHUB}/{'tree' if (ROOT / target).is_dir() else 'blob'}/main/{target}{link[2]})"
+
+    return re.sub(r"\]\((\.\./[^)#\s]*)(#[^)\s]*|)\)", mended, markdown)
