@@ -16,6 +16,10 @@ from typing import Any
 DEEPEST = 100
 # So many digits a whole number may have: longer ones cannot be made into floating-point numbers.
 LONGEST_NUMBER = 100
+# How a line begins in which CARMEN, g2o or TORO log what a robot saw and did.
+LINE_OF_A_LOG = re.compile(
+    rb"^(FLASER|RLASER|ROBOTLASER\d|RAWLASER\d|ODOM|PARAM|SYNC|TRUEPOS|NEFF|VERTEX2|VERTEX_SE2|EDGE2|EDGE_SE2)\s", re.MULTILINE
+)
 _LONG_NUMBER = re.compile(rf"\d{{{LONGEST_NUMBER + 1}}}")
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 _UNSEEN = re.compile("[\x7f-\x9f\u2028\u2029]")  # control characters that JSON need not escape, and that terminals obey

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, Literal, TypeAlias, overload
 
 from ssh_abduction import cards
 from ssh_abduction.errors import RangeError, TraceError, brief, checked_index, is_finite, is_whole, is_writable, named
-from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
+from ssh_abduction.files import LINE_OF_A_LOG, HalfCharacter, NotFinite, json_line, parse_json, write_file
 from ssh_abduction.odometry import Covariance, Displacement, Odometry, checked_covariance, checked_displacement
 from ssh_abduction.star import SPREAD, Entry, Gateway, Openings, Star, is_four, near_quarter, parse_star
 from ssh_abduction.words import counted, that_differ
@@ -37,6 +37,14 @@ LONGEST_LINE = 16 * 2**20
 SHOWN = 10  # So many steps of a trace are shown in a notebook.
 _KINDS = ("travel", "turn")
 _TURNS = ("right", "left", "around")
+# How files begin that are robots' logs, and no traces.
+_LOGS = {
+    b"\x1f\x8b": "gzipped data",
+    b"#ROSBAG V": "a bag of ROS 1",
+    b"SQLite format 3\0": "a bag of ROS 2",
+    b"\x89MCAP0": "MCAP",
+    b"# message formats defined": "a log of CARMEN",
+}
 _STEP_FIELDS = ("view", "image", "action", "star", "displacement", "covariance", "truth", "confidence")
 _ACTION_FIELDS = ("name", "kind", "turn", "gateway", "bearing")
 _QUARTERS = (None, "right", "around", "left")
@@ -540,7 +548,17 @@ def _parse(file: BinaryIO, source: str, path: str) -> Trace:
     return Trace(tuple(steps), header.get("name"), header.get("images"), odometry, extra=extra, source=path)
 
 
+def _kind_of_log(raw: bytes) -> str:
+    """What a file is that begins with a line, if it is a robot's log, and not a trace; else an empty text."""
+    kind = next((kind for magic, kind in _LOGS.items() if raw.startswith(magic)), "")
+    return kind or ("lines of CARMEN or g2o" if LINE_OF_A_LOG.match(raw) else "")
+
+
 def _record(raw: bytes, where: str) -> dict[str, Any]:
+    if where.endswith(":1") and (log := _kind_of_log(raw)):
+        raise TraceError(
+            f"{where}: header: expected a trace, got {log}, as robots' logs are; make a trace of it with ssh-abduction import LOG -o trace.jsonl"
+        )
     if b"\0" in raw:
         raise TraceError(f"{where}: line: expected text in UTF-8, got a null byte at column {raw.index(0) + 1}; is this a binary file?")
     try:

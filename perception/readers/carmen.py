@@ -31,22 +31,29 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import IO
+from typing import IO, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
 from perception.readers.lines import LONGEST_LINE, lines
-from perception.readers.scans import Damage, Laser, Scan
+from perception.readers.scans import Damage, Laser, Reading, Scan
 from ssh_abduction.errors import brief
+from ssh_abduction.files import LINE_OF_A_LOG
 from ssh_abduction.odometry import Pose, between, moved
 
 # Kinds of scans, the best first, as many logs hold each scan more than once: those that say how the laser is made and where it was, then those that lack one of these.
 KINDS = ("ROBOTLASER1", "FLASER", "RAWLASER1")
 VERTICES, EDGES = (b"VERTEX2", b"VERTEX_SE2"), (b"EDGE2", b"EDGE_SE2")
+# What the poses of the scans are, in the order in which the head of this module names it; `lines` where scans have none.
+Meaning: TypeAlias = Literal["edges", "restarts", "first corrected", "raw", "lines"]
+# So many scans wait for the next ODOM line, and a vertex is searched so many vertices behind another.
+MOST_WAITING = 100
+# Of the scans, such a share has to be as a rule says: of some scans lines are damaged.
+MOST_SCANS = 0.9
 # A scan has at most so many beams.
 MOST_BEAMS = 100_000
 # Poses beyond this, in metres, are no poses of a robot in a building.
@@ -92,15 +99,15 @@ class _Survey:
     scans: int = 0
     most: float = 0.0  # the largest range, and how often it came
     repeated: int = 0
-    mount: Pose | None = None  # the second pose in the frame of the first, at the first scan; and how far it wandered from that
-    wandered: tuple[float, float] = (0.0, 0.0)
-    same: bool = True
+    mount: Pose | None = None  # the first pose in the frame of the second, at the first scan; and of how many scans it is another
+    wandered: int = 0
+    same: int = 0  # scans whose two poses are the same
     restarts: int = (
         0  # scans whose pose the next ODOM line repeats, though the one before said otherwise; and scans at which this could be seen
     )
     moves: int = 0
     unmoved: list[int] = field(default_factory=list)  # lines of scans since whose predecessor no ODOM line tells how the robot moved
-    at_vertices: bool = True
+    at_vertices: int = 0  # scans whose second pose is that of the vertex before
 
 
 @dataclass(slots=True)
@@ -114,33 +121,21 @@ class _Found:
     edges: dict[tuple[int, int], Pose] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Reading:
-    """A log that has been surveyed, and can now be read.
-
-    items  scans, and what was skipped, in the order of the file
-    """
-
-    format: str
-    notes: tuple[str, ...]
-    items: Iterator[Scan | Damage]
-
-
 def looks_like(head: bytes) -> bool:
     """Whether the beginning of a file is that of a log in lines: one of them is a message that this reader knows."""
-    return (
-        re.search(
-            rb"^(FLASER|RLASER|ROBOTLASER\d|RAWLASER\d|ODOM|PARAM|SYNC|TRUEPOS|NEFF|VERTEX2|VERTEX_SE2|EDGE2|EDGE_SE2)\s",
-            head,
-            re.MULTILINE,
-        )
-        is not None
-    )
+    return LINE_OF_A_LOG.search(head) is not None
 
 
-def read(file: IO[bytes], source: str) -> Reading:
-    """A log in lines, surveyed. Raises LogError where it holds no scan, or no odometry."""
-    found = _survey(file, source)
+def read(file: IO[bytes], source: str, format: str | None) -> Reading:
+    """A log in lines, surveyed.
+
+    format  `carmen`, where vertices and edges are not read; `g2o`, where they have to be there; or None for what is there
+
+    Raises LogError where the log holds no scan, or no odometry.
+    """
+    found = _survey(file, source, format != "carmen")
+    if format == "g2o" and not found.vertices:
+        raise LogError(f"{source}: expected vertices in lines VERTEX2 or VERTEX_SE2, got none; leave the format out, or name carmen")
     if not found.kinds:
         others = ", ".join(f"{count} {tag}" for tag, count in found.tags.most_common(5)) or "none"
         raise LogError(
@@ -162,10 +157,10 @@ def _reading(file: IO[bytes], source: str, found: _Found, kind: str) -> Reading:
     return Reading("g2o" if found.vertices else "carmen", tuple(notes), _scans(file, source, found, kind, meaning, mount, reach))
 
 
-def _meaning(found: _Found, survey: _Survey, kind: str, source: str, notes: list[str]) -> str:
-    """What the poses of the scans are: `edges`, `restarts`, `lines`, `first corrected`, or `raw`, as the head of this module says."""
+def _meaning(found: _Found, survey: _Survey, kind: str, source: str, notes: list[str]) -> Meaning:
+    """What the poses of the scans are. Raises LogError."""
     if found.vertices:
-        if survey.at_vertices and kind == "ROBOTLASER1":
+        if survey.at_vertices >= MOST_SCANS * survey.scans:
             if not found.edges:
                 raise LogError(
                     f"{source}: expected odometry, got corrected poses alone (VERTEX2, and the same in {kind}) and no EDGE2; take the log before it was corrected"
@@ -180,7 +175,7 @@ def _meaning(found: _Found, survey: _Survey, kind: str, source: str, notes: list
         if not found.tags["ODOM"]:
             raise LogError(f"{source}: expected odometry, got neither ODOM lines nor poses in {kind}; record the odometer, too")
         return "lines"
-    if survey.same and (found.tags["NEFF"] or 2 * survey.restarts > survey.moves > 0):
+    if survey.same >= MOST_SCANS * survey.scans and (found.tags["NEFF"] or 2 * survey.restarts > survey.moves > 0):
         if not found.tags["ODOM"]:
             raise LogError(
                 f"{source}: expected odometry, got corrected poses alone (NEFF lines, but no ODOM); take the log before it was corrected"
@@ -195,13 +190,13 @@ def _meaning(found: _Found, survey: _Survey, kind: str, source: str, notes: list
                 f"No ODOM line tells how the robot moved before the scans in these {len(survey.unmoved)} lines, so that it seems to have stood still: {where}."
             )
         return "restarts"
-    if survey.wandered[0] > WANDERED[0] or survey.wandered[1] > WANDERED[1]:
+    if survey.wandered > (1 - MOST_SCANS) * survey.scans:
         notes.append(f"The first pose in {kind} wanders from the second: the first is taken for a corrected one, the second for odometry.")
         return "first corrected"
     return "raw"
 
 
-def _mount(found: _Found, survey: _Survey, meaning: str, kind: str) -> Pose:
+def _mount(found: _Found, survey: _Survey, meaning: Meaning, kind: str) -> Pose:
     """The pose of the laser in the frame of the robot: what its poses say, else what the parameters say."""
     own = survey.mount
     if own is not None and meaning in ("raw", "edges") and max(map(abs, own)) > ROUNDED:
@@ -227,7 +222,7 @@ def _reach(found: _Found, survey: _Survey, kind: str, notes: list[str]) -> float
     return reach
 
 
-def _survey(file: IO[bytes], source: str) -> _Found:
+def _survey(file: IO[bytes], source: str, with_graph: bool) -> _Found:
     found = _Found()
     odometer: Pose | None = None
     since: dict[str, int] = {}  # ODOM lines since the last scan of a kind
@@ -251,11 +246,10 @@ def _survey(file: IO[bytes], source: str) -> _Found:
                     waiting = None
                 odometer = pose
             elif tag == b"PARAM":
-                if len(tokens) > 2 and tokens[1] in _PARAMETERS:
-                    found.parameters[_PARAMETERS[tokens[1]]] = _number(tokens[2])
-            elif tag in VERTICES:
+                found.parameters.update(_parameter(tokens))
+            elif tag in VERTICES and with_graph:
                 found.vertices.append(_vertex(tokens))
-            elif tag in EDGES:
+            elif tag in EDGES and with_graph:
                 ends, motion = _edge(tokens)
                 found.edges.setdefault(ends, motion)
             elif (line := _scan_line(tokens)) is not None:
@@ -280,71 +274,120 @@ def _count(survey: _Survey, line: _ScanLine, vertex: Pose | None) -> None:
         survey.repeated += int(np.count_nonzero(ranges == most))
     if line.first is None or line.second is None:
         return
-    survey.same &= line.first == line.second
-    survey.at_vertices &= vertex is not None and _are_same(vertex, line.second)
+    survey.same += line.first == line.second
+    survey.at_vertices += vertex is not None and _are_same(vertex, line.second)
     mount = between(line.second, line.first)
     if survey.mount is None:
         survey.mount = mount
     x, y, angle = between(survey.mount, mount)
-    survey.wandered = max(survey.wandered[0], math.hypot(x, y)), max(survey.wandered[1], abs(angle))
+    survey.wandered += math.hypot(x, y) > WANDERED[0] or abs(angle) > WANDERED[1]
 
 
 def _are_same(a: Pose, b: Pose) -> bool:
     return all(abs(v) <= ROUNDED for v in between(a, b))
 
 
-def _scans(file: IO[bytes], source: str, found: _Found, kind: str, meaning: str, mount: Pose, reach: float) -> Iterator[Scan | Damage]:
+def _scans(file: IO[bytes], source: str, found: _Found, kind: str, meaning: Meaning, mount: Pose, reach: float) -> Iterator[Scan | Damage]:
     """The scans, and what was skipped."""
-    chain: Pose = (0.0, 0.0, 0.0)  # odometry, where it is pieced together
-    odometer: Pose | None = None  # the last ODOM line's
-    restarts = False  # whether the next ODOM line starts from a corrected pose
-    vertex: tuple[int, Pose] | None = None
-    truth: tuple[Pose, Pose] | None = None  # of the last TRUEPOS line: the true pose, and the odometer's
-
+    odometer = _Odometer(found, meaning)
+    waiting: list[Scan | Damage] = []  # scans without a pose, whose place is known with the next ODOM line
+    fov = found.parameters.get("fov")
     for number, raw in lines(file, source):
+        tag = b""
         try:
             tokens = _tokens(raw)
             if not tokens:
                 continue
             tag = tokens[0]
-            if tag == b"ODOM":
-                pose = _pose(tokens, 1)
-                if odometer is not None and not restarts:
-                    chain = moved(chain, between(odometer, pose))
-                odometer, restarts = pose, False
-            elif tag == b"TRUEPOS":
-                truth = _pose(tokens, 1), _pose(tokens, 4)
-            elif tag in VERTICES:
-                following = _vertex(tokens)
-                if vertex is not None and meaning == "edges":
-                    chain = moved(chain, _motion(found, vertex[0], following[0]))
-                vertex = following
-            elif (line := _scan_line(tokens)) is not None and line.kind == kind:
-                first, second = line.first, line.second
-                corrected: Pose | None = None
-                if meaning == "edges":
-                    odometry, corrected = chain, second
-                elif meaning == "restarts":
-                    odometry, corrected = chain, second
-                    odometer, restarts = second, True
-                elif meaning == "lines":
-                    if odometer is None:
-                        raise _Damaged("expected an ODOM line before the first scan, got none")
-                    odometry = odometer
-                else:
-                    assert first is not None
-                    assert second is not None
-                    odometry = second
-                    if meaning == "first corrected":
-                        corrected = first
-                if truth is not None:
-                    corrected = moved(truth[0], between(truth[1], odometry))
-                elif vertex is not None:
-                    corrected = vertex[1]
-                yield Scan(*_measured(line, mount, reach, found.parameters.get("fov")), odometry, corrected, line.time, number)
+            if tag != kind.encode():
+                odometer.hear(tag, tokens)
+            elif (line := _scan_line(tokens)) is not None:
+                scan = Scan(*_measured(line, mount, reach, fov), *odometer.place(line), line.time, number)
+                waiting.append(scan)
         except _Damaged as damage:
-            restarts = meaning == "restarts"  # the line may have been a scan's, after which ODOM lines start anew
-            yield Damage(number, str(damage))
+            odometer.mishear(tag)
+            waiting.append(Damage(number, str(damage)))
+        if meaning != "lines" or tag == b"ODOM" or len(waiting) >= MOST_WAITING:
+            yield from map(odometer.placed, waiting)
+            waiting.clear()
+    yield from map(odometer.placed, waiting)
+
+
+@dataclass(slots=True)
+class _Odometer:
+    """Where the odometer puts the scans, by the lines of a log so far.
+
+    chain     odometry, where it is pieced together
+    last      pose and time of the last ODOM line; and of the one before
+    restarts  whether the next ODOM line starts from a corrected pose, and tells of no motion
+    truth     of the last TRUEPOS line: the true pose, and the odometer's
+    """
+
+    found: _Found
+    meaning: Meaning
+    chain: Pose = (0.0, 0.0, 0.0)
+    last: tuple[Pose, float | None] | None = None
+    before: tuple[Pose, float | None] | None = None
+    restarts: bool = False
+    vertex: tuple[int, Pose] | None = None
+    truth: tuple[Pose, Pose] | None = None
+
+    def hear(self, tag: bytes, tokens: list[bytes]) -> None:
+        """Take in a line that is no scan's. Raises _Damaged."""
+        if tag == b"ODOM":
+            pose = _pose(tokens, 1)
+            if self.last is not None and not self.restarts:
+                self.chain = moved(self.chain, between(self.last[0], pose))
+            self.before, self.last, self.restarts = self.last, (pose, _time(tokens, 7)), False
+        elif tag == b"TRUEPOS":
+            self.truth = _pose(tokens, 1), _pose(tokens, 4)
+        elif tag == b"PARAM":
+            _parameter(tokens)  # which the survey took, as it took the edges, without a word of what is damaged
+        elif self.found.vertices and tag in EDGES:
+            _edge(tokens)
+        elif self.found.vertices and tag in VERTICES:
+            vertex = _vertex(tokens)
+            if self.vertex is not None and self.meaning == "edges":
+                self.chain = moved(self.chain, _motion(self.found.edges, self.vertex[0], vertex[0]))
+            self.vertex = vertex
+
+    def mishear(self, tag: bytes) -> None:
+        """Take in that a line is damaged. It may have been a scan's, after which ODOM lines start anew; then the next one is not taken for a motion."""
+        self.restarts |= self.meaning == "restarts" and tag != b"ODOM"
+
+    def place(self, line: _ScanLine) -> tuple[Pose, Pose | None]:
+        """The pose of a scan by the odometer, and its corrected one, where it is known. Raises _Damaged."""
+        first, second = line.first, line.second
+        corrected: Pose | None = None
+        if first is None or second is None:
+            odometry = self.chain  # until it is placed
+        elif self.meaning == "edges":
+            if self.vertex is None or not _are_same(self.vertex[1], second):
+                raise _Damaged("expected the pose of the vertex before, got another; the line of its own vertex is missing")
+            return self.chain, second
+        elif self.meaning == "restarts":
+            odometry, corrected = self.chain, second
+            self.last, self.restarts = (second, line.time), True
+        else:
+            odometry = second
+            corrected = first if self.meaning == "first corrected" else None
+        if self.truth is not None:
+            corrected = moved(self.truth[0], between(self.truth[1], odometry))
+        elif self.vertex is not None:
+            corrected = self.vertex[1]
+        return odometry, corrected
+
+    def placed(self, item: Scan | Damage) -> Scan | Damage:
+        """A scan that has no pose of its own, where the odometer was at its time between the last two ODOM lines; all else unchanged."""
+        if self.meaning != "lines" or isinstance(item, Damage) or self.last is None:
+            return item
+        (start, began), (end, ended) = self.before or self.last, self.last
+        if began is None or ended is None or item.time is None or not began <= item.time <= ended or began == ended:
+            share = 0.0  # times that are cut, or run backwards, tell nothing
+        else:
+            share = (item.time - began) / (ended - began)
+        dx, dy, turned = between(start, end)
+        return replace(item, odometry=moved(start, (share * dx, share * dy, share * turned)))
 
 
 def _tokens(raw: bytes | None) -> list[bytes]:
@@ -359,13 +402,21 @@ def _tokens(raw: bytes | None) -> list[bytes]:
     return tokens
 
 
-def _motion(found: _Found, start: int, end: int) -> Pose:
-    """The relative motion from one vertex to the next. Raises _Damaged where no edge says it."""
-    if (motion := found.edges.get((start, end))) is not None:
+def _motion(edges: dict[tuple[int, int], Pose], start: int, end: int) -> Pose:
+    """The relative motion from one vertex to another, over those between where there is no edge. Raises _Damaged where no edges say it."""
+    if (motion := edges.get((start, end))) is not None:
         return motion
-    if (back := found.edges.get((end, start))) is not None:
+    if (back := edges.get((end, start))) is not None:
         return between(back, (0.0, 0.0, 0.0))
-    raise _Damaged(f"expected an EDGE2 from vertex {start} to {end}, got none")
+    motion = (0.0, 0.0, 0.0)
+    for vertex in range(start, min(end, start + MOST_WAITING)):
+        if (step := edges.get((vertex, vertex + 1))) is None:
+            break
+        motion = moved(motion, step)
+    else:
+        if start < end <= start + MOST_WAITING:
+            return motion
+    raise _Damaged(f"expected an EDGE2 from vertex {start} to {end}, got none; the robot seems to have stood still")
 
 
 def _measured(line: _ScanLine, mount: Pose, reach: float, fov: float | None) -> tuple[NDArray[np.float64], Laser]:
@@ -452,6 +503,13 @@ def _edge(tokens: list[bytes]) -> tuple[tuple[int, int], Pose]:
     if len(tokens) < 3:
         raise _Damaged("expected an edge between two vertices, got fewer words")
     return (_whole(tokens[1], "vertex"), _whole(tokens[2], "vertex")), _pose(tokens, 3)
+
+
+def _parameter(tokens: list[bytes]) -> dict[str, float]:
+    """What a PARAM line says, if it says something of the laser."""
+    if len(tokens) < 2 or tokens[1] not in _PARAMETERS:
+        return {}
+    return {_PARAMETERS[tokens[1]]: _number(tokens[2] if len(tokens) > 2 else b"")}
 
 
 def _time(tokens: list[bytes], at: int) -> float | None:

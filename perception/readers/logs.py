@@ -4,28 +4,38 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import IO
 
 from perception.errors import LogError
-from perception.readers import carmen
-from perception.readers.lines import lines, opened
-from perception.readers.scans import Damage, RobotLog, Scan
+from perception.readers import bags, carmen
+from perception.readers.lines import is_gzip, lines, opened
+from perception.readers.scans import Damage, Reading, RobotLog, Scan
 from ssh_abduction.errors import brief, named
 
-FORMATS = ("carmen", "g2o")
+# The formats of logs, and what each is.
+LINES = {
+    "carmen": "lines of CARMEN: FLASER, ROBOTLASER1 or RAWLASER1, and ODOM",
+    "g2o": "lines of g2o or TORO: VERTEX2, EDGE2 and ROBOTLASER1",
+}
+BAGS = {"ros1": "a bag of ROS 1", "ros2": "a bag of ROS 2: a folder, or its file", "mcap": "a file of MCAP"}
+FORMATS = {**LINES, **BAGS}
 # So many bytes at the beginning of a file tell its format.
 HEAD = 2**16
 
 
-def read_log(path: str | os.PathLike[str], format: str | None = None) -> RobotLog:
+def read_log(
+    path: str | os.PathLike[str], format: str | None = None, *, scan_topic: str | None = None, odom_topic: str | None = None
+) -> RobotLog:
     """A robot's log.
 
-    format  one of FORMATS; guessed from the content, never from the name, where it is None
+    format                  one of FORMATS; where it is None it is guessed from what the file holds, never from its name
+    scan_topic, odom_topic  the topics of a bag that are to be read, where it has several of scans or of odometry
 
-    Raises LogError where the file cannot be read, is of no known format, or holds no scan. A damaged part of it is skipped, and listed in the log's `damaged`.
+    A damaged part is skipped, and stands in the log's `damaged`. Raises LogError where the file cannot be read, is of no known format, or holds no scan or no odometry.
     """
-    with opened(path) as file:
-        reading = _reading(file, path, format)
+    with _reading(path, format, scan_topic, odom_topic) as reading:
         scans: list[Scan] = []
         damaged: list[Damage] = []
         for item in reading.items:
@@ -33,28 +43,65 @@ def read_log(path: str | os.PathLike[str], format: str | None = None) -> RobotLo
                 scans.append(item)
             else:
                 damaged.append(item)
+    if not scans:
+        raise LogError(
+            f"{named(path)}: expected scans, got none that can be read; {len(damaged)} are damaged, first: {damaged[0].what if damaged else 'none'}"
+        )
     return RobotLog(tuple(scans), tuple(damaged), reading.format, os.fspath(path), reading.notes)
 
 
-def stream_log(path: str | os.PathLike[str], format: str | None = None) -> Iterator[Scan | Damage]:
+def stream_log(
+    path: str | os.PathLike[str], format: str | None = None, *, scan_topic: str | None = None, odom_topic: str | None = None
+) -> Iterator[Scan | Damage]:
     """The scans of a robot's log one after another, and what was skipped, in the order of the file. Arguments and errors as for `read_log`."""
-    with opened(path) as file:
-        yield from _reading(file, path, format).items
+    with _reading(path, format, scan_topic, odom_topic) as reading:
+        yield from reading.items
 
 
-def _reading(file: IO[bytes], path: str | os.PathLike[str], format: str | None) -> carmen.Reading:
-    source = named(path)
+@contextmanager
+def _reading(path: str | os.PathLike[str], format: str | None, scan_topic: str | None, odom_topic: str | None) -> Iterator[Reading]:
     if format is not None and format not in FORMATS:
         raise LogError(f"format: expected one of {', '.join(FORMATS)}, got {brief(format)}")
-    if format is None and not carmen.looks_like(_head(file, source)):
-        raise LogError(f"{source}: expected a robot's log ({', '.join(FORMATS)})")
-    return carmen.read(file, source)
+    if _is_folder(path):
+        if format not in (None, "ros2", "mcap"):
+            raise LogError(f"{named(path)}: expected a file of the format {format}, got a folder; name the file")
+        with bags.opened(path, "ros2") as bag:
+            yield bags.read(bag, scan_topic, odom_topic)
+        return
+    with opened(path) as file:
+        found = format or _format(file, named(path))
+        if found in LINES:
+            if scan_topic is not None or odom_topic is not None:
+                raise LogError(f"{named(path)}: expected a bag, as a topic is named, got the format {found}; leave the topics out")
+            yield carmen.read(file, named(path), format)
+            return
+    with bags.opened(path, found) as bag:
+        yield bags.read(bag, scan_topic, odom_topic)
 
 
-def _head(file: IO[bytes], source: str) -> bytes:
+def _is_folder(path: str | os.PathLike[str]) -> bool:
+    try:
+        return Path(path).is_dir()
+    except ValueError:  # a null character: opening the file says so
+        return False
+
+
+def _format(file: IO[bytes], source: str) -> str:
+    """The format of a file by what it holds. Raises LogError where it is none of FORMATS."""
+    formats = "; ".join(f"{name} ({what})" for name, what in FORMATS.items())
     head = b""
     for _, line in lines(file, source):
-        head += line or b""
+        head += (line or b"")[:HEAD]
         if len(head) > HEAD:
             break
-    return head
+    if not head:
+        raise LogError(f"{source}: expected a robot's log, got an empty file; formats: {formats}")
+    if (bag := bags.format_of(head)) is not None:
+        if is_gzip(file):
+            raise LogError(f"{source}: expected a bag ({bag}) as it was recorded, got a gzipped one; unpack it with gunzip")
+        return bag
+    if carmen.looks_like(head):
+        return "carmen"
+    raise LogError(
+        f"{source}: expected a robot's log, got a file that begins with {brief(head[:40].decode('utf-8', 'replace'))}; formats: {formats}"
+    )

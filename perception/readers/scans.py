@@ -11,6 +11,7 @@ Angles are radians counterclockwise, lengths metres; a pose is (x, y, heading). 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.odometry import Pose
 
-__all__ = ["Damage", "Laser", "Pose", "RobotLog", "Scan"]
+__all__ = ["Damage", "Laser", "Pose", "Reading", "RobotLog", "Scan"]
 
 
 @dataclass(frozen=True)
@@ -94,3 +95,15 @@ class RobotLog:
 
     def __len__(self) -> int:
         return len(self.scans)
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A log whose format and meaning are known, and whose scans can now be read, once.
+
+    items  scans, and what was skipped, in the order of the file
+    """
+
+    format: str
+    notes: tuple[str, ...]
+    items: Iterator[Scan | Damage]
