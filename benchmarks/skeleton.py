@@ -1,0 +1,298 @@
+"""What people use for topological maps of metric ones: the skeleton of the free space of an occupancy grid, pruned, as a graph.
+
+    python benchmarks/skeleton.py LOG [LOG ...] -o FOLDER [--poses corrected|odometry]
+
+draws for each log the grid, the graph and the way of the robot. All scans are laid into the grid at their poses: at the corrected ones, which the robot did not have, or at those of the odometry. The skeleton (Zhang & Suen 1984,
+scikit-image) of the cells where a robot fits has branches to every niche; one that ends within the circle around its junction that touches the nearest wall, or hardly beyond it, is cut off, as is usual (Thrun 1998, "Learning metric-topological maps";
+Shaked & Bruckstein 1998, "Pruning medial axes"). Junctions in one open space, nearer to each other than to the walls, are one node. Nodes are junctions and dead ends. All lengths are in metres, and the same for all logs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_opening, distance_transform_edt, label
+
+from perception.readers.scans import Pose, RobotLog
+from simulator.motion import moved
+
+Array = NDArray[np.float64]
+CELL = 0.1  # metres a side
+FARTHEST = 12.0  # Beams are laid into the grid so far: beyond that they diverge, and leave cells out.
+WALL = 0.2  # The share of the beams at a cell that have to end there for a wall.
+LEAST = 2  # So many beams have to have passed a cell that is free.
+RADIUS = 0.25  # of the robot
+SPECK = 0.3  # square metres: smaller obstacles, and smaller holes in what was seen, are noise
+SPUR = 1.0  # A branch that ends is kept where it is so much longer than the distance of its junction from the walls.
+REACH = 1.5  # The robot passes a node within this, or within the node's distance from the walls.
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """What all scans say of each cell: 1 free, 0 wall, NaN not seen. (rows, columns); row 0 is at the least y.
+
+    origin  x and y of the lower left corner
+    """
+
+    cells: Array
+    origin: tuple[float, float]
+
+    def at(self, points: Array) -> NDArray[np.int_]:
+        """The row and column of each point, (n, 2)."""
+        return np.floor((points[:, ::-1] - self.origin[::-1]) / CELL).astype(int)
+
+    def points(self, cells: NDArray[Any]) -> Array:
+        """The middle of each cell, (n, 2): x and y, of rows and columns."""
+        return (np.asarray(cells, dtype=float)[:, ::-1] + 0.5) * CELL + self.origin
+
+
+def poses_of(log: RobotLog, kind: str) -> list[Pose]:
+    """The poses of all scans, corrected or by odometry. Raises ValueError where there are none."""
+    if kind == "odometry":
+        return [scan.odometry for scan in log.scans]
+    poses = [scan.corrected for scan in log.scans if scan.corrected is not None]
+    if len(poses) < len(log):
+        raise ValueError(f"{log.source}: expected corrected poses, got {len(poses)} for {len(log)} scans; take --poses odometry")
+    return poses
+
+
+def grid_of(log: RobotLog, poses: Sequence[Pose]) -> Grid:
+    """An occupancy grid of all scans at these poses."""
+    along = np.arange(0, FARTHEST, CELL / 2)
+    low = np.floor((np.min([pose[:2] for pose in poses], axis=0) - FARTHEST) / CELL).astype(int) - 2
+    columns, rows = np.ceil((np.max([pose[:2] for pose in poses], axis=0) + FARTHEST) / CELL).astype(int) + 2 - low
+    wall, clear = np.zeros(rows * columns), np.zeros(rows * columns)
+
+    def number(points: Array) -> NDArray[np.int_]:
+        column, row = (np.floor(points / CELL).astype(int) - low).T
+        return np.asarray(row * columns + column)
+
+    for scan, pose in zip(log.scans, poses, strict=True):
+        x, y, heading = moved(pose, scan.laser.mount)
+        measured = np.isfinite(scan.ranges)
+        bearings, ranges = heading + scan.laser.bearings[measured], scan.ranges[measured]
+        rays = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+        near = (ranges <= FARTHEST) & (ranges < scan.laser.reach)
+        np.add.at(wall, number((x, y) + ranges[near, None] * rays[near]), 1)
+        before = along[None, :] < np.minimum(ranges, FARTHEST)[:, None] - CELL
+        points = (x, y) + along[None, :, None] * rays[:, None, :]
+        clear[np.unique(number(points[before]))] += 1  # each scan says once that a cell is free
+    cells = np.full(rows * columns, np.nan)
+    cells[clear >= LEAST] = 1.0
+    cells[wall > WALL / (1 - WALL) * clear] = 0.0
+    cells = cells.reshape(rows, columns)
+    used = [np.flatnonzero(~np.isnan(cells).all(axis=axis)) for axis in (1, 0)]
+    (bottom, top), (left, right) = ((found[0] - 1, found[-1] + 2) for found in used)
+    return Grid(cells[bottom:top, left:right], (float(low[0] + left) * CELL, float(low[1] + bottom) * CELL))
+
+
+def free_space(grid: Grid, poses: Sequence[Pose]) -> tuple[NDArray[np.bool_], Array]:
+    """The cells where a robot fits that has been at these poses; and how many metres each cell is from what was not seen to be free, specks aside."""
+    seen = _without_specks(~_without_specks(grid.cells != 1.0))
+    clear = distance_transform_edt(seen) * CELL
+    parts, _ = label(binary_opening(clear >= RADIUS))
+    rows, columns = grid.at(np.array(poses)[:, :2]).T
+    at = np.bincount(parts[rows, columns], minlength=2)
+    at[0] = 0  # where the robot stood, it may have touched what is drawn as a wall
+    return np.asarray(parts == at.argmax()), clear
+
+
+def _without_specks(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The parts of a mask that are no specks."""
+    parts, _ = label(mask)
+    large = np.bincount(parts.ravel()) * CELL**2 >= SPECK
+    large[0] = False
+    return np.asarray(large[parts])
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A graph in metric space. Nodes have `at`, (x, y), and `clear`, their distance from the walls; edges `way`, (n, 2) points, and `metres`."""
+
+    grid: Grid
+    free: NDArray[np.bool_]
+    graph: nx.MultiGraph
+
+    def events(self, poses: Sequence[Pose]) -> list[tuple[int, int]]:
+        """Where the robot passed nodes, in order: the scan that was nearest, and the node. Of two nodes within reach it passes the nearer one."""
+        nodes = sorted(self.graph)
+        at = np.array([self.graph.nodes[n]["at"] for n in nodes])
+        reach = np.maximum(REACH, [self.graph.nodes[n]["clear"] for n in nodes])
+        distance = np.linalg.norm(np.array(poses)[:, None, :2] - at, axis=2)
+        nearest = distance.argmin(axis=1)
+        within = distance.min(axis=1) <= reach[nearest]
+        passed: list[tuple[int, int]] = []
+        last = -1  # the scan at which the robot was last within reach of the last node
+        for scan in np.flatnonzero(within):
+            number = int(nearest[scan])
+            if passed and passed[-1][1] == number and distance[last : scan + 1, number].max() <= 2 * reach[number]:
+                if distance[scan, number] < distance[passed[-1][0], number]:
+                    passed[-1] = (int(scan), number)
+            else:
+                passed.append((int(scan), number))
+            last = int(scan)
+        return [(scan, nodes[number]) for scan, number in passed]
+
+
+def skeleton_of(log: RobotLog, poses: Sequence[Pose]) -> Skeleton:
+    """The pruned skeleton of the free space that a log shows at these poses."""
+    from skimage.morphology import skeletonize
+
+    grid = grid_of(log, poses)
+    free, clear = free_space(grid, poses)
+    graph = _chains(_pixels(skeletonize(free)))
+    for node, data in graph.nodes(data=True):
+        data["clear"] = float(clear[node])
+    _prune(graph)
+    graph = _merged(graph)
+    for _, data in graph.nodes(data=True):
+        data["at"] = grid.points(np.array([data["cell"]]))[0]
+    for *_, data in graph.edges(data=True):
+        data["way"] = grid.points(np.array(data["cells"]))
+    return Skeleton(grid, free, nx.convert_node_labels_to_integers(graph, ordering="sorted"))
+
+
+def _pixels(thin: NDArray[np.bool_]) -> nx.Graph:
+    """The cells of a skeleton that touch each other; of three that touch at a corner only the two straight joints are kept."""
+    graph = nx.Graph()
+    cells = {(int(r), int(c)) for r, c in np.argwhere(thin)}
+    graph.add_nodes_from(cells)
+    for r, c in cells:
+        graph.add_edges_from(((r, c), other) for other in ((r + 1, c), (r, c + 1)) if other in cells)
+    for r, c in cells:
+        for side in (-1, 1):
+            if (r + 1, c + side) in cells and (r + 1, c) not in cells and (r, c + side) not in cells:
+                graph.add_edge((r, c), (r + 1, c + side))
+    return graph
+
+
+def _chains(pixels: nx.Graph) -> nx.MultiGraph:
+    """Junctions and ends of a graph of cells, joined by the chains of cells between them. A ring without a junction has one at one of its cells."""
+    ends = [cell for cell, degree in pixels.degree if degree != 2]
+    ends += [min(ring) for ring in nx.connected_components(pixels) if all(pixels.degree(cell) == 2 for cell in ring)]
+    graph = nx.MultiGraph()
+    graph.add_nodes_from(ends)
+    known = set(ends)
+    for end in ends:
+        for first in pixels[end]:
+            way = [end, first]
+            while way[-1] not in known:
+                way.append(next(cell for cell in pixels[way[-1]] if cell != way[-2]))
+            if (way[0], way[1]) <= (way[-1], way[-2]):  # each chain is found from both ends
+                _join(graph, way)
+    return graph
+
+
+def _join(graph: nx.MultiGraph, cells: Sequence[tuple[int, int]]) -> None:
+    graph.add_edge(cells[0], cells[-1], cells=list(cells), metres=CELL * sum(math.dist(a, b) for a, b in pairwise(cells)))
+
+
+def _prune(graph: nx.MultiGraph) -> None:
+    """Cut off branches that hardly leave the circle of their junction, the shortest first, and join what is left where a junction is none any more."""
+    while True:
+        branches = []
+        for end in graph:
+            if graph.degree(end) == 1:
+                ((_, junction, data),) = graph.edges(end, data=True)
+                beyond = data["metres"] - graph.nodes[junction]["clear"]
+                if graph.degree(junction) > 2 and beyond < SPUR:
+                    branches.append((beyond, end, junction))
+        if not branches:
+            return
+        _, end, junction = min(branches)
+        graph.remove_node(end)
+        _straighten(graph, junction)
+
+
+def _straighten(graph: nx.MultiGraph, node: Any) -> None:
+    """Take out a node that is no junction any more, as two different edges end there."""
+    if graph.degree(node) == 2 and graph.number_of_edges(node, node) == 0:
+        (_, _, one), (_, _, other) = graph.edges(node, data=True)
+        to = one["cells"] if one["cells"][-1] == node else one["cells"][::-1]
+        onward = other["cells"] if other["cells"][0] == node else other["cells"][::-1]
+        graph.remove_node(node)
+        _join(graph, [*to, *onward[1:]])
+
+
+def _merged(graph: nx.MultiGraph) -> nx.MultiGraph:
+    """Junctions that lie within each other's circle are one node, at the one that is farthest from the walls."""
+    near = nx.Graph()
+    near.add_nodes_from(graph)
+    for a, b, data in graph.edges(data=True):
+        if (
+            a != b
+            and graph.degree(a) > 2
+            and graph.degree(b) > 2
+            and data["metres"] <= max(graph.nodes[a]["clear"], graph.nodes[b]["clear"])
+        ):
+            near.add_edge(a, b)
+    home = {}
+    for group in nx.connected_components(near):
+        middle = max(group, key=lambda n: (graph.nodes[n]["clear"], n))
+        home.update(dict.fromkeys(group, middle))
+    merged = nx.MultiGraph()
+    for node, middle in home.items():
+        if node == middle:
+            merged.add_node(node, cell=node, clear=graph.nodes[node]["clear"])
+    for a, b, data in graph.edges(data=True):
+        if home[a] != home[b] or not near.has_edge(a, b):
+            merged.add_edge(home[a], home[b], **data)
+    return merged
+
+
+def draw(path: Path, skeleton: Skeleton, poses: Sequence[Pose], title: str) -> None:
+    """Draw the grid, the graph with its nodes by number, and the way of the robot."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    grid = skeleton.grid
+    rows, columns = grid.cells.shape
+    figure, axes = plt.subplots(figsize=(14, 14 * max(0.4, min(1.4, rows / columns))))
+    shown = np.where(np.isnan(grid.cells), 0.75, np.where(skeleton.free, 1.0, np.where(grid.cells == 1.0, 0.93, 0.0)))
+    x, y = grid.origin
+    axes.imshow(shown, cmap="gray", vmin=0, vmax=1, origin="lower", extent=(x, x + columns * CELL, y, y + rows * CELL))
+    axes.plot(*np.array(poses)[:, :2].T, color="tab:orange", linewidth=1, label="way of the robot")
+    for *_, data in skeleton.graph.edges(data=True):
+        axes.plot(*data["way"].T, color="tab:blue", linewidth=1.5)
+    passed = {node for _, node in skeleton.events(poses)}
+    for node, data in skeleton.graph.nodes(data=True):
+        axes.plot(*data["at"], "o", color="tab:red" if node in passed else "tab:cyan", markersize=5)
+        axes.annotate(str(node), data["at"], fontsize=7, xytext=(3, 3), textcoords="offset points")
+    axes.set_title(title)
+    axes.set_aspect("equal")
+    figure.savefig(path, dpi=80, bbox_inches="tight")
+    plt.close(figure)
+
+
+def main() -> None:
+    from perception.readers.logs import read_log
+
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("logs", nargs="+", metavar="LOG")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("--poses", choices=("corrected", "odometry"), default="corrected")
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    for name in options.logs:
+        log = read_log(name)
+        poses = poses_of(log, options.poses)
+        skeleton = skeleton_of(log, poses)
+        events = skeleton.events(poses)
+        text = f"{Path(name).name.partition('.')[0]}: {len(skeleton.graph)} nodes, {len({node for _, node in events})} of them passed, {len(events)} times"
+        draw(options.output / f"{Path(name).name.partition('.')[0]}.png", skeleton, poses, text)
+        print(text)
+
+
+if __name__ == "__main__":
+    main()
