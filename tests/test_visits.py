@@ -203,7 +203,7 @@ def test_the_relations_of_freiburg_agree_with_the_corrected_poses() -> None:
     times = [float(line[-3]) for line in lines if line[0] == "ROBOTLASER1"][::12]
     ssh_map = labelled(range(len(poses)), range(len(poses)))
     trace = posed([list(pose) for pose in poses], ["travel"] * (len(poses) - 1), times)
-    by_poses = evaluate_visits([ssh_map], trace).places
+    nearer, near = (evaluate_visits([ssh_map], trace, near=metres).places.returns for metres in (1.5, 2))
     by_relations = evaluate_visits([ssh_map], trace, relations=Relations.load(FREIBURG / "fr079.relations")).places
-    assert by_relations.judged > 0.95 * by_poses.judged
-    assert by_relations.returns == pytest.approx(by_poses.returns, rel=0.1)
+    assert by_relations.judged > 0.95 * len(poses) * (len(poses) - 1) / 2
+    assert nearer < by_relations.returns < near  # pairs about 2 m apart are in doubt

@@ -1,0 +1,250 @@
+"""Which places a robot really visited, and how right the events of a mapper are: those of a trace, or those of a skeleton.
+
+    python benchmarks/visited.py TRACE --log LOG [--truth drive.json] [-o named.jsonl]
+
+An event is a visit as a mapper has it: a scan, and the place where the mapper says that it was taken. Truth comes of the poses that somebody corrected, or of the simulator, which writes
+what it knows beside a log (format ssh-drive). With -o the trace is written with the names of the true places, so that `ssh-abduction evaluate maps.json named.jsonl` can name dstates, places and paths.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
+from skeleton import poses_of
+
+from perception.readers.logs import read_log
+from ssh_abduction import DState, SSHMap, Trace
+from ssh_abduction.evaluation import Evaluation, MapVisits, VisitsEvaluation, evaluate, evaluate_visits
+
+Array = NDArray[np.float64]
+# A robot visits a place when it comes so near to it, in metres. In ACES3, anything from 1.5 to 6 m makes the same 15 visits.
+REACH = 3.0
+# Where a door is nearer than this, in metres, an event is at the door.
+DOOR = 1.0
+# Events at no known place are at one place if they are on the average within this, in metres.
+APART = 2.0
+# ACES3: three corridors along x, and three along y, in metres of the corrected poses. Each crossing is a place.
+ACES_COLUMNS, ACES_ROWS = (-20.0, -1.0, 22.5), (-0.5, -19.0, -39.0)
+ACES_NAMES = ("NW", "N", "NE"), ("W", "C", "E"), ("SW", "S", "SE")
+ACES_ROUTE = ["N", "NE", "E", "SE", "S", "SW", "W", "NW", "N", "C", "S", "C", "W", "C", "E"]
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A stay at a true place, from the first scan there to the last."""
+
+    place: str
+    first: int
+    last: int
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known of a log, for evaluation only.
+
+    poses   (n, 3): where each scan was taken; metres and radians
+    visits  to the places that a mapper should find, in order; empty where nobody knows which these are
+    doors   where the doors are: x and y by name
+    rooms   the room in which each scan was taken; empty where nobody knows
+    grid    whether places are at crossings of the grid of ACES3, whose corridors are the true paths
+    """
+
+    poses: Array
+    visits: tuple[Visit, ...] = ()
+    doors: Mapping[str, Sequence[float]] | None = None
+    rooms: tuple[str | None, ...] = ()
+    grid: bool = False
+
+    @staticmethod
+    def of_aces(poses: Array) -> Truth:
+        """The 15 visits of ACES3. Raises ValueError where the corrected poses do not pass the places in the order that the log is known for."""
+        places = {name: (x, y) for y, names in zip(ACES_ROWS, ACES_NAMES, strict=True) for x, name in zip(ACES_COLUMNS, names, strict=True)}
+        visits = visits_of(places, poses)
+        if (route := [visit.place for visit in visits]) != ACES_ROUTE:
+            raise ValueError(f"expected the route {' '.join(ACES_ROUTE)}, got {' '.join(route)}; give the corrected poses of ACES3")
+        return Truth(poses, visits, grid=True)
+
+    @staticmethod
+    def load(path: Path) -> Truth:
+        """What the simulator wrote beside a log."""
+        told = json.loads(path.read_text())
+        poses = np.array(told["poses"])
+        doors = {name: door["at"] for name, door in told.get("doors", {}).items()}
+        if not doors:
+            return Truth(poses, tuple(Visit(visit["place"], visit["first"], visit["last"]) for visit in told["visits"]))
+        return Truth(poses, doors=doors, rooms=tuple(told["scans"]))
+
+    def matched(self, scans: Sequence[int]) -> list[int | None]:
+        """For each event the visit that it is at; of several events at one visit, the one nearest to its middle. None where it is at none."""
+        found: list[int | None] = [None] * len(scans)
+        for number, visit in enumerate(self.visits):
+            middle = (visit.first + visit.last) / 2
+            at = [i for i, scan in enumerate(scans) if visit.first <= scan <= visit.last]
+            if at:
+                found[min(at, key=lambda i: abs(scans[i] - middle))] = number
+        return found
+
+    def names(self, scans: Sequence[int]) -> list[str]:
+        """The true place at which each of these scans was taken: that of the visit; else a door; else one that is named after the room, with others near it."""
+        named: list[str | None] = [next((v.place for v in self.visits if v.first <= scan <= v.last), None) for scan in scans]
+        at = self.poses[np.asarray(scans, dtype=int), :2]
+        for i, (x, y) in enumerate(at):
+            if named[i] is None and self.doors:
+                door = min(self.doors, key=lambda name: math.dist(self.doors[name], (x, y)))  # type: ignore[index]
+                named[i] = door if math.dist(self.doors[door], (x, y)) <= DOOR else None
+        rooms = [self.rooms[scan] if self.rooms else None for scan in scans]
+        for room in dict.fromkeys(rooms):
+            here = [i for i in range(len(scans)) if rooms[i] == room and named[i] is None]
+            groups = fcluster(linkage(at[here], "average"), APART, "distance") if len(here) > 1 else np.ones(len(here), int)
+            numbers = {group: number for number, group in enumerate(dict.fromkeys(groups.tolist()), 1)}
+            for i, group in zip(here, groups.tolist(), strict=True):
+                named[i] = f"{room or 'elsewhere'} {numbers[group]}"
+        return [name or "" for name in named]
+
+
+def visits_of(places: Mapping[str, Sequence[float]], poses: Array, reach: float = REACH) -> tuple[Visit, ...]:
+    """The stays within reach of places, (x, y) by name, of a robot that was at these poses. Between two stays at one place the robot comes to another."""
+    visits: list[Visit] = []
+    for scan, (x, y, _) in enumerate(poses.tolist()):
+        place = min(places, key=lambda name: math.dist(places[name], (x, y)))
+        if math.dist(places[place], (x, y)) <= reach:
+            first = visits.pop().first if visits and visits[-1].place == place else scan
+            visits.append(Visit(place, first, scan))
+    return tuple(visits)
+
+
+@dataclass(frozen=True)
+class Events:
+    """The events of a mapper, in order. scans: where; places: at which of its places; None where it does not say."""
+
+    scans: tuple[int, ...]
+    places: tuple[Hashable, ...]
+
+    @staticmethod
+    def of(trace: Trace, ssh_map: SSHMap | None = None) -> Events:
+        """The visits of a trace that was made of a log, and where a map has them."""
+        starts = [t for t in range(len(trace)) if t == 0 or trace.actions[t - 1].kind != "turn"]
+        places = [None if ssh_map is None else ssh_map.dstates[ssh_map.labels[t]].place for t in starts]
+        return Events(tuple(int(trace.steps[t].extra["scan"]) for t in starts), tuple(places))
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How right a mapper is.
+
+    nodes      how many places it has, of those that were visited
+    precision, recall  of events: of its events, the share that is a true visit; of the true visits, the share that has an event. None where true visits are not known
+    named      accuracy, edges and pairs by the names of the true places, in the terms of `evaluate`
+    posed      pairs of events by poses, in the terms of `evaluate`
+    """
+
+    nodes: int
+    events: int
+    precision: float | None
+    recall: float | None
+    named: Evaluation
+    posed: VisitsEvaluation
+
+    @property
+    def places(self) -> MapVisits:
+        return self.posed.maps[0]
+
+    @property
+    def isomorphic(self) -> bool:
+        """Whether its places are what was visited: each event is a true visit and the other way round, where these are known, and places are told apart rightly."""
+        return bool(self.named.maps[0].places_right) and self.precision in (None, 1.0) and self.recall in (None, 1.0)
+
+
+def judged(events: Events, truth: Truth) -> Figures:
+    """How right these events are."""
+    matched = truth.matched(events.scans)
+    hits = sum(visit is not None for visit in matched)
+    names = truth.names(events.scans)
+    numbers = {place: i for i, place in enumerate(dict.fromkeys(events.places))}
+    said = Trace.from_steps("v" * len(names), ["travel"] * (len(names) - 1))
+    steps = [
+        replace(step, truth={"place": name, "pose": truth.poses[scan].tolist()})
+        for step, name, scan in zip(said.steps, names, events.scans, strict=True)
+    ]
+    trace = replace(said, steps=tuple(steps))
+    # A map of places alone: each has one dstate. So accuracy is that of places.
+    dstates = tuple(DState(i, "v", i, None, None) for i in range(len(numbers)))
+    ssh_map = SSHMap(tuple(numbers[place] for place in events.places), dstates, (), tuple(range(len(numbers))))
+    by_name = replace(
+        trace, steps=tuple(replace(step, truth={"dstate": step.truth["place"], "place": step.truth["place"]}) for step in steps)
+    )
+    return Figures(
+        nodes=len(numbers),
+        events=len(names),
+        precision=hits / len(names) if truth.visits else None,
+        recall=hits / len(truth.visits) if truth.visits else None,
+        named=evaluate([ssh_map], by_name),
+        posed=evaluate_visits([ssh_map], trace),
+    )
+
+
+def with_names(trace: Trace, truth: Truth) -> Trace:
+    """The trace with the true place of each step as its truth; in ACES3 with its heading, path and direction, too, where the step has a pose."""
+    names = truth.names([int(step.extra["scan"]) for step in trace.steps])
+    known = {visit.place for visit in truth.visits}
+    steps = []
+    for step, name in zip(trace.steps, names, strict=True):
+        told: dict[str, Any] = {"place": name}
+        pose = step.truth.get("pose") if isinstance(step.truth, Mapping) else None
+        if pose is not None:
+            told["pose"] = pose
+            quarter = round(pose[2] / (math.pi / 2)) % 4
+            told["heading"] = "ENWS"[quarter]
+            if truth.grid and name in known:
+                row = next(i for i, names in enumerate(ACES_NAMES) if name in names)
+                along = f"row {row}" if quarter % 2 == 0 else f"column {ACES_NAMES[row].index(name)}"
+                told |= {"path": along, "direction": 1 if quarter < 2 else -1}
+        steps.append(replace(step, truth=told))
+    return replace(trace, steps=tuple(steps))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("trace", metavar="TRACE", help="what import made of the log")
+    parser.add_argument("--log", type=Path, help="the log, whose corrected poses are the truth")
+    parser.add_argument("--truth", type=Path, help="what the simulator wrote beside the log")
+    parser.add_argument("-o", "--output", help="write the trace with the names of the true places")
+    options = parser.parse_args()
+    trace = Trace.load(options.trace)
+    truth = truth_of(options.log, options.truth)
+    events = Events.of(trace)
+    matched = truth.matched(events.scans)
+    for scan, name, visit in zip(events.scans, truth.names(events.scans), matched, strict=True):
+        x, y, heading = truth.poses[scan]
+        print(
+            f"scan {scan:4}  ({x:6.1f}, {y:6.1f}, {math.degrees(heading):4.0f})  {name}{'' if visit is not None or not truth.visits else '  no visit'}"
+        )
+    missed = [visit.place for number, visit in enumerate(truth.visits) if number not in matched]
+    if truth.visits:
+        hits = len(truth.visits) - len(missed)
+        print(
+            f"{len(matched)} events, precision {hits / len(matched):.2f}, recall {hits / len(truth.visits):.2f}; missed: {' '.join(missed) or 'none'}"
+        )
+    if options.output:
+        with_names(trace, truth).save(options.output)
+
+
+def truth_of(log: Path, truth: Path | None = None) -> Truth:
+    """The truth of a log: what the simulator says, or its corrected poses; of ACES3 also the visits to its nine places."""
+    if truth is not None:
+        return Truth.load(truth)
+    poses = np.array(poses_of(read_log(str(log)), "corrected"))
+    return Truth.of_aces(poses) if log.name.startswith("aces") else Truth(poses)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""The judges of benchmarks/: what a robot truly visited, and what the skeleton of its map says."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from skeleton import CELL, _chains, _pixels, _prune, poses_of, skeleton_of
+from visited import ACES_COLUMNS, ACES_NAMES, ACES_ROUTE, ACES_ROWS, Events, Truth, Visit, judged, truth_of, visits_of, with_names
+
+from perception.readers.scans import Laser, RobotLog, Scan
+from simulator.laser import BEAMS, BEARINGS, meetings
+from ssh_abduction import Trace, evaluate, solve
+
+ROOT = Path(__file__).parent.parent
+LOGS = ROOT.parent / "shared" / "data" / "logs"
+
+
+def aces_poses(spacing: float = 1.0) -> np.ndarray:
+    """A drive through the crossings of ACES3 in the true order, in straight lines."""
+    at = {name: (x, y) for y, names in zip(ACES_ROWS, ACES_NAMES, strict=True) for x, name in zip(ACES_COLUMNS, names, strict=True)}
+    poses = []
+    for here, there in pairwise(ACES_ROUTE):
+        (x, y), (dx, dy) = at[here], np.subtract(at[there], at[here])
+        parts = round(math.hypot(dx, dy) / spacing)
+        poses += [(x + dx * k / parts, y + dy * k / parts, math.atan2(dy, dx)) for k in range(parts)]
+    return np.array([*poses, (*at[ACES_ROUTE[-1]], 0.0)])
+
+
+def test_the_route_of_aces_is_recognised_and_another_is_refused() -> None:
+    poses = aces_poses()
+    truth = Truth.of_aces(poses)
+    assert [visit.place for visit in truth.visits] == ACES_ROUTE
+    with pytest.raises(ValueError, match=r"^expected the route N NE .* C E, got E C"):
+        Truth.of_aces(poses[::-1])
+
+
+def test_a_trace_with_the_names_of_true_places_has_the_true_map() -> None:
+    """The route of examples/aces3-route.jsonl, laid onto scans: its names come back, and so does what evaluate says of it."""
+    shipped = Trace.load(ROOT / "examples" / "aces3-route.jsonl")
+    poses = aces_poses()
+    truth = Truth.of_aces(poses)
+    steps, visit = [], -1
+    for t, step in enumerate(shipped.steps):
+        visit += t == 0 or shipped.actions[t - 1].kind != "turn"
+        there = truth.visits[visit]
+        scan = (there.first + there.last) // 2
+        pose = [*poses[scan][:2], {"E": 0, "N": math.pi / 2, "W": math.pi, "S": -math.pi / 2}[step.truth["heading"]]]
+        steps.append(replace(step, truth={"pose": pose}, extra={"scan": scan}))
+    named = with_names(replace(shipped, steps=tuple(steps)), truth)
+    for step, told in zip(shipped.steps, named.steps, strict=True):
+        assert (told.truth["place"], told.truth["heading"]) == (step.truth["place"], step.truth["heading"])
+    found = evaluate([], named)
+    assert (found.true_dstates, found.true_places, found.true_paths) == (22, 9, 6)
+    maps = solve(shipped, maps=0).maps
+    assert [one.accuracy for one in evaluate(maps, named).maps] == [one.accuracy for one in evaluate(maps, shipped).maps]
+
+    figures = judged(Events.of(named, maps[0]), truth)
+    assert (figures.precision, figures.recall, figures.isomorphic) == (1, 1, False)
+    assert figures.named.maps[0].place_precision == evaluate([maps[0]], shipped).maps[0].place_precision or figures.nodes == 10
+
+
+def test_events_are_matched_to_visits_one_by_one() -> None:
+    poses = np.array([(float(x), 0.0, 0.0) for x in range(40)])
+    truth = Truth(poses, visits_of({"A": (5, 0), "B": (20, 0)}, poses))
+    assert truth.visits == (Visit("A", 2, 8), Visit("B", 17, 23))
+    assert truth.matched([1, 3, 5, 30]) == [None, None, 0, None]
+    assert truth.names([1, 3, 5, 30, 31]) == ["elsewhere 1", "A", "A", "elsewhere 2", "elsewhere 2"]
+    figures = judged(Events((3, 5, 18, 30), ("a", "a", "b", "c")), truth)
+    assert (figures.nodes, figures.precision, figures.recall, figures.isomorphic) == (3, 1 / 2, 1, False)
+    assert judged(Events((5, 18), ("a", "b")), truth).isomorphic
+    assert not judged(Events((5, 18), ("a", "a")), truth).isomorphic
+
+
+def test_events_in_buildings_are_at_doors_or_in_rooms(tmp_path: Path) -> None:
+    told = {
+        "poses": [[x, 0.0, 0.0] for x in (0, 1.2, 2, 2.6, 5, 5.5, 9)],
+        "scans": ["room 0", "room 0", "room 1", "room 1", "room 1", "room 1", "room 1"],
+        "doors": {"door 0": {"rooms": ["room 0", "room 1"], "at": [1.7, 0]}},
+    }
+    (tmp_path / "truth.json").write_text(json.dumps(told))
+    truth = Truth.load(tmp_path / "truth.json")
+    assert truth.names(range(7)) == ["room 0 1", "door 0", "door 0", "door 0", "room 1 1", "room 1 1", "room 1 2"]
+
+
+def test_branches_that_hardly_leave_their_junction_are_cut_off() -> None:
+    drawn = """
+        .....#.......
+        .....#.......
+        ############.
+        .........#...
+        .........#...
+        .........#...
+    """
+    thin = np.array([[c == "#" for c in line] for line in drawn.split()])
+    graph = _chains(_pixels(thin))
+    assert sorted(degree for _, degree in graph.degree) == [1, 1, 1, 1, 3, 3]
+    assert sum(data["metres"] for *_, data in graph.edges(data=True)) == pytest.approx(CELL * 16)
+    for _, data in graph.nodes(data=True):
+        data["clear"] = 0.1
+    _prune(graph)
+    assert sorted(graph) == [(2, 0), (5, 9)]  # no branch is a metre longer than its junction is from a wall
+
+
+def test_a_ring_has_one_node() -> None:
+    thin = np.zeros((6, 8), dtype=bool)
+    thin[1:5, 1:7] = True
+    thin[2:4, 2:6] = False
+    graph = _chains(_pixels(thin))
+    assert (len(graph), [round(data["metres"], 6) for *_, data in graph.edges(data=True)]) == (1, [1.6])
+
+
+def crossing() -> RobotLog:
+    """A robot drives along two corridors that cross, 3 m wide and 20 m long: there, back to the crossing, and along the other."""
+    ways = [(float(x), 0.0, 0.0) for x in np.arange(-8, 8.5, 0.5)]
+    ways += [(float(x), 0.0, math.pi) for x in np.arange(8, -0.5, -0.5)]
+    ways += [(0.0, float(y), math.pi / 2) for y in np.arange(0.5, 8.5, 0.5)]
+    ways += [(0.0, float(y), -math.pi / 2) for y in np.arange(8, -8.5, -0.5)]
+    corners = [(-10, -1.5), (-1.5, -1.5), (-1.5, -10), (1.5, -10), (1.5, -1.5), (10, -1.5)]
+    outline = np.array([*corners, *((-x, -y) for x, y in corners)], dtype=float)
+    ranges = meetings(np.hstack([outline, np.roll(outline, -1, axis=0)]), np.array(ways), BEARINGS).min(axis=2)
+    laser = Laser(float(BEARINGS[0]), math.radians(1), BEAMS, 30.0)
+    return RobotLog(tuple(Scan(scan, laser, pose, pose) for scan, pose in zip(ranges, ways, strict=True)))
+
+
+def test_the_skeleton_of_a_crossing_has_five_nodes() -> None:
+    pytest.importorskip("skimage")
+    log = crossing()
+    poses = poses_of(log, "corrected")
+    skeleton = skeleton_of(log, poses)
+    degrees = sorted(degree for _, degree in skeleton.graph.degree)
+    assert degrees == [1, 1, 1, 1, 4]
+    (middle,) = [node for node, degree in skeleton.graph.degree if degree == 4]
+    assert math.hypot(*skeleton.graph.nodes[middle]["at"]) < 0.5
+    passed = [node for _, node in skeleton.events(poses)]
+    assert [node == middle for node in passed] == [True, False, True, False, True, False]  # the end behind the start is farther away
+    assert len(set(passed)) == 4
+
+
+@pytest.mark.skipif(not LOGS.exists(), reason="needs ../shared/data")
+def test_the_corrected_poses_of_aces_pass_the_nine_places_in_the_known_order() -> None:
+    assert len(truth_of(LOGS / "aces-corrected.log.gz").visits) == 15
