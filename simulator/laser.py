@@ -44,8 +44,17 @@ class Laser:
 
     def _cast(self, segments: Array, poses: Array) -> Array:
         """The distance from each pose to the nearest wall along each beam, (m, 180) metres."""
-        nearest: Array = np.minimum(meetings(segments, poses, BEARINGS).min(axis=2), self.reach)
+        near = _near(segments, poses, self.reach)
+        nearest: Array = np.minimum(meetings(near, poses, BEARINGS).min(axis=2, initial=np.inf), self.reach)
         return nearest
+
+
+def _near(segments: Array, poses: Array, reach: float) -> Array:
+    """The walls that a laser may see from poses: those whose boxes are at most `reach` off the box of the poses."""
+    low, high = poses[:, :2].min(0) - reach, poses[:, :2].max(0) + reach
+    ends, others = segments[:, :2], segments[:, 2:]
+    near: Array = segments[(np.minimum(ends, others) <= high).all(1) & (np.maximum(ends, others) >= low).all(1)]
+    return near
 
 
 def meetings(segments: Array, poses: Array, bearings: Array) -> Array:

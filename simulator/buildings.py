@@ -1,0 +1,160 @@
+"""The walls of a floor plan, with openings where the doors are: a world that a robot with a body can drive in.
+
+A plan draws each room as a polygon and each door as a point on its outline. So the walls are the outlines of all rooms, and a door is an opening of DOOR metres in the outlines of both of
+its rooms, moved along the wall where a corner would narrow it. Where the outlines are apart, as walls are thick, jambs lead from one to the other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.errors import SimulatorError
+from simulator.plans import Door, Plan, Room
+from simulator.world import World
+
+Array = NDArray[np.float64]
+# Metres: how wide a door is, and how far it is off the corners of its rooms.
+DOOR, OFF = 1.0, 0.1
+# Metres before and behind a door in which nothing stands: what is drawn there of other walls would close it.
+DEPTH = 0.25
+
+
+@dataclass(frozen=True)
+class Opening:
+    """A door as an opening in a wall.
+
+    middle  metres
+    along   the direction of the wall, radians
+    width   metres
+    depth   metres from the outline of one room to that of the other
+    """
+
+    middle: tuple[float, float]
+    along: float
+    width: float
+    depth: float
+
+    def frame(self, points: Array) -> Array:
+        """Points, (n, 2), along the wall and across it, metres from the middle."""
+        cos, sin = math.cos(self.along), math.sin(self.along)
+        off = points - np.array(self.middle)
+        return np.column_stack([cos * off[:, 0] + sin * off[:, 1], cos * off[:, 1] - sin * off[:, 0]])
+
+    def point(self, along: float, across: float) -> tuple[float, float]:
+        """The point that is so far along the wall from the middle, and across it to the left."""
+        cos, sin = math.cos(self.along), math.sin(self.along)
+        return self.middle[0] + cos * along - sin * across, self.middle[1] + sin * along + cos * across
+
+    @property
+    def threshold(self) -> Array:
+        """The segment from jamb to jamb, (1, 4)."""
+        return np.array([[*self.point(-self.width / 2, 0.0), *self.point(self.width / 2, 0.0)]])
+
+
+@dataclass(frozen=True)
+class Building:
+    """A plan, its walls, and its doors as openings, numbered as in the plan."""
+
+    plan: Plan
+    segments: Array = field(repr=False)
+    openings: tuple[Opening, ...] = field(repr=False)
+
+    @classmethod
+    def of(cls, plan: Plan) -> Building:
+        """The building of a plan. Raises SimulatorError where a room has no outline."""
+        for number, room in enumerate(plan.rooms):
+            if len(room.polygon) < 3:
+                raise SimulatorError(
+                    f"{plan.name}: room {number}: expected a bounding_polygon of three points or more, got {len(room.polygon)}; draw its outline"
+                )
+        walls = np.vstack([_outline(room) for room in plan.rooms])
+        openings = tuple(_opening(plan, door) for door in plan.doors)
+        for opening in openings:
+            walls = _cut(walls, opening)
+        jambs = [_jambs(opening) for opening in openings]
+        return cls(plan, np.vstack([walls, *jambs]), openings)
+
+    def world(self) -> World:
+        """The building as a world."""
+        return World(self.plan.name, self.segments, angles="any")
+
+
+def _outline(room: Room) -> Array:
+    """The walls of a room, (n, 4)."""
+    corners = np.array(room.polygon)
+    walls = np.hstack([corners, np.roll(corners, -1, axis=0)])
+    drawn: Array = walls[np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1]) > 1e-6]
+    return drawn
+
+
+def _opening(plan: Plan, door: Door) -> Opening:
+    """The opening of a door in the walls of its rooms that are nearest to it."""
+    walls = [_nearest(_outline(plan.rooms[room]), door.position) for room in door.rooms]
+    longest = max(walls, key=lambda wall: float(np.hypot(*(wall[2:] - wall[:2]))))
+    way = longest[2:] - longest[:2]
+    flat = Opening(door.position, math.atan2(way[1], way[0]), DOOR, 0.0)
+    spans = [_span(flat, _outline(plan.rooms[room])) for room in door.rooms]
+    low, high = max(low for low, _ in spans) + OFF, min(high for _, high in spans) - OFF
+    width = min(DOOR, high - low) if high > low else DOOR
+    shift = float(np.clip(0.0, low + width / 2, high - width / 2)) if high > low else 0.0
+    across = [_across(flat, wall, shift) for wall in walls]
+    return Opening(flat.point(shift, (across[0] + across[1]) / 2), flat.along, width, abs(across[0] - across[1]))
+
+
+def _span(flat: Opening, walls: Array) -> tuple[float, float]:
+    """From where to where a room has a wall along a door, metres from the door: an outline may have corners within a straight wall."""
+    ends = np.stack([flat.frame(walls[:, :2]), flat.frame(walls[:, 2:])], axis=1)  # (n, 2 ends, along and across)
+    way = ends[:, 1] - ends[:, 0]
+    level = (np.abs(ends[:, :, 1]) < DEPTH).all(1) & (np.abs(way[:, 1]) < np.abs(way[:, 0]))
+    stretches: list[tuple[float, float]] = []
+    for wall in sorted((float(min(wall)), float(max(wall))) for wall in ends[level, :, 0]):
+        if stretches and wall[0] <= stretches[-1][1] + OFF:
+            stretches[-1] = stretches[-1][0], max(stretches[-1][1], wall[1])
+        else:
+            stretches.append(wall)
+    return min(stretches, key=lambda stretch: max(stretch[0], -stretch[1]), default=(0.0, 0.0))
+
+
+def _across(flat: Opening, wall: Array, along: float) -> float:
+    """How far across a door a wall is, so far along it."""
+    ends = flat.frame(wall.reshape(2, 2))
+    return float(np.interp(along, *ends[np.argsort(ends[:, 0])].T))
+
+
+def _nearest(walls: Array, point: tuple[float, float]) -> Array:
+    """The wall that is nearest to a point, (4,)."""
+    along = walls[:, 2:] - walls[:, :2]
+    share = np.clip(((np.array(point) - walls[:, :2]) * along).sum(1) / (along**2).sum(1), 0, 1)
+    off = np.hypot(*(walls[:, :2] + share[:, None] * along - np.array(point)).T)
+    nearest: Array = walls[int(off.argmin())]
+    return nearest
+
+
+def _cut(walls: Array, opening: Opening) -> Array:
+    """The walls without what stands in an opening: each is clipped to the outside of a rectangle (Liang and Barsky)."""
+    starts, ends = opening.frame(walls[:, :2]), opening.frame(walls[:, 2:])
+    half = np.array([opening.width / 2, opening.depth / 2 + DEPTH])
+    way = ends - starts
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, other = (-half - starts) / way, (half - starts) / way
+    still = way == 0
+    inside = np.abs(starts) <= half
+    enter = np.where(still, np.where(inside, -np.inf, np.inf), np.minimum(one, other)).max(1).clip(0, 1)
+    leave = np.where(still, np.where(inside, np.inf, -np.inf), np.maximum(one, other)).min(1).clip(0, 1)
+    hit = enter < leave
+    way = walls[:, 2:] - walls[:, :2]
+    before = np.hstack([walls[:, :2], walls[:, :2] + enter[:, None] * way])[hit & (enter > 0)]
+    after = np.hstack([walls[:, :2] + leave[:, None] * way, walls[:, 2:]])[hit & (leave < 1)]
+    return np.vstack([walls[~hit], before, after])
+
+
+def _jambs(opening: Opening) -> Array:
+    """The two sides of an opening in a thick wall, (2, 4); none in a thin one."""
+    if opening.depth < 0.02:
+        return np.empty((0, 4))
+    half, deep = opening.width / 2, opening.depth / 2
+    return np.array([[*opening.point(side, -deep), *opening.point(side, deep)] for side in (-half, half)])

@@ -1,0 +1,244 @@
+"""Rounds through buildings: a robot with a body really drives from room to room, through the doors of a floor plan, and logs scans all along.
+
+It leaves each room by the door that it has passed least often, as in plans.tour, until the round is long enough, and then goes home by as few doors as it can. In a room with one door it
+drives to the middle and turns back; from door to door it takes the way in between.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.buildings import Building
+from simulator.control import Driver
+from simulator.cruise import follow
+from simulator.drive import EVERY, Drive, Recorder
+from simulator.errors import SimulatorError
+from simulator.freespace import CELL, FreeSpace, Part
+from simulator.laser import Laser
+from simulator.odometer import Odometer
+from simulator.plans import Plan
+from simulator.robot import Body, Robot
+from ssh_abduction.errors import brief, is_finite
+
+Array = NDArray[np.float64]
+Point = tuple[float, float]
+Within = tuple[int, int | None, int | None]  # a room, and two of its doors; None stands for its middle
+# Metres that a round is long before the robot goes home.
+METRES = 200.0
+# Metres from the wall to where a passage through a door begins and ends.
+APPROACH = 0.45
+# Metres off the walls at which the middle of a room is, where there is so much room.
+MIDDLE = 0.8
+# The scanner in buildings: it sees as far as those of the recorded logs.
+LASER = Laser(noise=0.01, reach=30.0)
+
+
+class Rooms:
+    """A building as a robot of a certain radius can drive in it: within each room, while all doors are shut, and straight through doors.
+
+    graph    the rooms as nodes, and the doors as edges through which the robot fits and to which it can come, both by their numbers
+    middles  for each room of the graph the point that the robot drives to when it goes to its middle
+    """
+
+    def __init__(self, building: Building, radius: float) -> None:
+        self.building = building
+        self.space = FreeSpace.of(building.segments, radius)
+        self._shut = self.space.drawn(np.vstack([opening.threshold for opening in building.openings]))
+        self._sides = [_sides(building, number) for number in range(len(building.openings))]
+        self._ways: dict[Within, Array] = {}
+        self.middles: dict[int, Point] = {}
+        fits = [number for number in range(len(building.openings)) if self._fits(number)]
+        reached: Counter[int] = Counter()
+        for room in range(len(building.plan.rooms)):
+            doors = [number for number in fits if room in self._sides[number]]
+            part = self._part(room)
+            regions = part.region(np.array([self._sides[number][room] for number in doors]).reshape(-1, 2)).tolist()
+            if any(regions):
+                region, _ = Counter(filter(None, regions)).most_common(1)[0]
+                self.middles[room] = part.nearest(region, building.plan.rooms[room].centre, MIDDLE)
+                reached.update(number for number, found in zip(doors, regions, strict=True) if found == region)
+        self.graph = nx.MultiGraph()
+        self.graph.add_edges_from((*building.plan.doors[number].rooms, number) for number in fits if reached[number] == 2)
+
+    def way(self, room: int, start: int | None, goal: int | None) -> Array:
+        """The way within a room from door to door, (n, 2) metres; None stands for its middle."""
+        if (room, start, goal) not in self._ways:
+            ends = [self.middles[room] if door is None else self._sides[door][room] for door in (start, goal)]
+            way = self._part(room).way(*ends)
+            assert way is not None  # as both are in one region
+            self._ways[room, start, goal] = way
+        return self._ways[room, start, goal]
+
+    def behind(self, room: int, door: int) -> int:
+        """The room to which a door leads from a room."""
+        return next(other for other in self._sides[door] if other != room)
+
+    def through(self, door: int, room: int) -> Array:
+        """The way through a door from a room, (n, 2) metres; the middle of the door is on it."""
+        return _line(self._sides[door][room], self._sides[door][self.behind(room, door)])
+
+    def _fits(self, door: int) -> bool:
+        """Whether the robot can drive straight through a door."""
+        line = _line(*self._sides[door].values()) if len(self._sides[door]) == 2 else np.empty((0, 2))
+        return len(line) > 0 and bool((self.space.part(line).off(line) >= self.space.least).all())
+
+    def _part(self, room: int) -> Part:
+        """The part of the building where a room is, with all doors shut."""
+        sides = [sides[room] for sides in self._sides if room in sides]
+        return self.space.part(np.vstack([np.array(self.building.plan.rooms[room].polygon), *sides]), self._shut)
+
+
+def _sides(building: Building, number: int) -> dict[int, Point]:
+    """For the rooms of a door the points at which a passage through it begins and ends; none where it cannot be told which room is on which side."""
+    opening, door = building.openings[number], building.plan.doors[number]
+    sides = [opening.point(0.0, side * (opening.depth / 2 + APPROACH)) for side in (-1, 1)]
+    here, there = (building.plan.rooms[room] for room in door.rooms)
+    for one, other in (sides, sides[::-1]):
+        if (holds(here.polygon, one) and not holds(here.polygon, other)) or (holds(there.polygon, other) and not holds(there.polygon, one)):
+            return {door.rooms[0]: one, door.rooms[1]: other}
+    return {}
+
+
+def holds(polygon: Sequence[Point], point: Point) -> bool:
+    """Whether a polygon holds a point: a ray from there to the right crosses its outline an odd number of times."""
+    x, y = point
+    crossings = sum(
+        (y1 > y) != (y2 > y) and x < x1 + (y - y1) * (x2 - x1) / (y2 - y1)
+        for (x1, y1), (x2, y2) in zip(polygon, (*polygon[1:], polygon[0]), strict=True)
+    )
+    return crossings % 2 == 1
+
+
+def _line(start: Point, goal: Point) -> Array:
+    """A straight way, (n, 2) metres."""
+    line: Array = np.linspace(start, goal, 1 + math.ceil(math.dist(start, goal) / CELL))
+    return line
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """A round through rooms, which ends where it began.
+
+    way    (n, 2) metres
+    rooms  for each point of the way the room in which it is
+    doors  for each passage the number of the point at which it is in the door, and the door
+    """
+
+    way: Array = field(repr=False)
+    rooms: NDArray[np.intp] = field(repr=False)
+    doors: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def drawn(cls, rooms: Rooms, metres: float, chance: np.random.Generator) -> Round:
+        """A round that is drawn by chance. Raises SimulatorError where no two rooms are connected by doors through which the robot fits."""
+        parts = sorted(nx.connected_components(rooms.graph), key=lambda part: (-len(part), min(part)))
+        if not parts:
+            plan = rooms.building.plan
+            raise SimulatorError(
+                f"{plan.name}: expected rooms with doors between them through which the robot fits, got none; take another plan, or a smaller robot"
+            )
+        home = int(chance.choice(sorted(parts[0])))
+        ways: list[Array] = []
+        labels: list[int] = []
+        doors: list[tuple[int, int]] = []
+        for room, start, goal in _legs(rooms, home, metres, chance):
+            within = rooms.way(room, start, goal)
+            ways.append(within)
+            labels += [room] * len(within)
+            if goal is not None:
+                through = rooms.through(goal, room)
+                middle = len(through) // 2
+                doors.append((len(labels) + middle, goal))
+                ways.append(through)
+                labels += [room] * middle + [rooms.behind(room, goal)] * (len(through) - middle)
+        return cls(np.vstack(ways), np.array(labels), tuple(doors))
+
+
+def _legs(rooms: Rooms, home: int, metres: float, chance: np.random.Generator) -> Iterator[Within]:
+    """The parts of a round: in which room, from which door, to which; None stands for the middle of the room."""
+    passed: Counter[int] = Counter()
+    room, came, done = home, None, 0.0
+    while True:
+        doors = sorted(number for _, _, number in rooms.graph.edges(room, keys=True))
+        onward = [door for door in doors if door != came]
+        if came is not None and not onward:
+            yield room, came, None
+            done += _length(rooms.way(room, came, None))
+            came = None
+        if done >= metres:
+            break
+        least = min(passed[door] for door in onward or doors)
+        goal = int(chance.choice([door for door in onward or doors if passed[door] == least]))
+        yield room, came, goal
+        done += _length(rooms.way(room, came, goal)) + _length(rooms.through(goal, room))
+        passed[goal] += 1
+        room, came = rooms.behind(room, goal), goal
+    for here, there in pairwise(nx.shortest_path(rooms.graph, room, home)):
+        goal = min(rooms.graph[here][there])
+        yield here, came, goal
+        came = goal
+    yield home, came, None
+
+
+def _length(way: Array) -> float:
+    return float(np.hypot(*np.diff(way, axis=0).T).sum())
+
+
+def record_plan(
+    plan: Plan,
+    tours: int = 1,
+    seed: int = 0,
+    *,
+    metres: float = METRES,
+    laser: Laser = LASER,
+    body: Body | None = None,
+    odometer: Odometer | None = None,
+    every: float = EVERY,
+) -> Drive:
+    """Drive one round through a building `tours` times, which ends where it began, and log scans all along, each `every` metres, and in turns each ten degrees.
+
+    metres  that a round is long, before the robot goes home
+    Raises SimulatorError where no two rooms are connected.
+    """
+    if tours < 1:
+        raise SimulatorError(f"tours: expected 1 or more, got {tours}")
+    if not is_finite(metres) or metres <= 0:
+        raise SimulatorError(f"metres: expected a length above 0, got {brief(metres)}; 200 is usual")
+    body = body or Body()
+    rooms = Rooms(Building.of(plan), body.radius)
+    chance, motion = (np.random.default_rng([seed, k]) for k in (0, 1))
+    tour = Round.drawn(rooms, metres, chance)
+    world = rooms.building.world()
+    x, y = tour.way[0].tolist()
+    recorder = Recorder(every)
+    robot = Robot(body, (x, y, float(chance.uniform(-math.pi, math.pi))), motion)
+    driver = Driver(world, robot, laser, motion, recorder=recorder)
+    recorder.note(world, robot.pose)
+    come = [0]  # for each scan the point of the round to which the robot had come, counted on from round to round
+    for number in range(tours):
+        for at in follow(driver, rooms.space, tour.way):
+            come += [number * len(tour.way) + at] * (recorder.taken - len(come))
+    drive = recorder.drive(f"{plan.name}, {tours} tours, seed {seed}", laser, odometer or Odometer(), seed)
+    crossings = [(number * len(tour.way) + at, door) for number in range(tours) for at, door in tour.doors]
+    return drive.judged(
+        {_name(room): middle for room, middle in rooms.middles.items()},
+        [_name(int(tour.rooms[at % len(tour.way)])) for at in come],
+        crossings=[{"door": f"door {door}", "scan": int(np.searchsorted(come, at))} for at, door in crossings],
+        doors={
+            f"door {number}": {"rooms": [_name(one), _name(other)], "at": [round(v, 4) for v in rooms.building.openings[number].middle]}
+            for one, other, number in sorted(rooms.graph.edges(keys=True), key=lambda edge: edge[2])
+        },
+    )
+
+
+def _name(room: int) -> str:
+    """As in the truth of plans.tour."""
+    return f"room {room}"
