@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,8 +86,8 @@ def _around_obstacles(driver: Driver, space: FreeSpace, way: Array, numbers: Cel
 
 def _obstacles(driver: Driver, space: FreeSpace) -> Array:
     """The points where the laser shows something that is neither a known wall nor marked already, (n, 2) metres. They are marked in the space."""
-    image = driver.look()
     x, y, heading = driver.robot.pose
+    image = replace(driver.laser, reach=WATCH).scan(driver.world, np.array([driver.robot.pose]), driver.rng)[0]
     near = image < WATCH
     angles = heading + BEARINGS[near]
     points = np.column_stack([x + image[near] * np.cos(angles), y + image[near] * np.sin(angles)])

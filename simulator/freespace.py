@@ -29,6 +29,8 @@ CELL = 0.1
 MARGIN = 2.0
 # Metres off a wall from which on more room is not better, and how many times as long a metre counts that leads along a wall.
 ROOM, NARROW = 1.0, 4.0
+# Cells around start and goal within which a way may be nearer to walls than elsewhere.
+LEEWAY = 2
 # Metres, the spread of the filter that rounds the corners of ways.
 SMOOTH = 0.3
 
@@ -162,10 +164,16 @@ def _clearance(occupied: Mask) -> Array:
 
 
 def _shortest(clearance: Array, least: float, start: tuple[int, int], goal: tuple[int, int]) -> Cells | None:
-    """The cells of the cheapest way, (n, 2) rows and columns, through cells that are at least so far off the walls. Start and goal are free in any case."""
+    """The cells of the cheapest way, (n, 2) rows and columns, through cells that are at least so far off the walls.
+
+    Around start and goal, where a robot may have come nearer to something than it would plan to, all cells are free that are not beside an occupied one.
+    """
     rows, columns = clearance.shape
     free = clearance >= least
-    free[start] = free[goal] = True
+    for row, column in (start, goal):
+        beside = slice(max(row - LEEWAY, 0), row + LEEWAY + 1), slice(max(column - LEEWAY, 0), column + LEEWAY + 1)
+        free[beside] |= clearance[beside] > 1.5 * CELL
+        free[row, column] = True
     price = 1 + (NARROW - 1) * (1 - np.minimum(clearance / ROOM, 1.0)) ** 2
     numbers = np.arange(rows * columns).reshape(rows, columns)
     ends: list[Cells] = []

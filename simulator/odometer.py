@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,18 +52,25 @@ class Odometer:
                     f"odometer.{field.name}: expected a number from {least:g} to {WORST:g}, got {brief(value)}; choose a smaller error"
                 )
 
+    def as_noisy_as(self, along: float) -> Odometer:
+        """This odometer with noise of another size, which keeps its proportions. Raises SimulatorError."""
+        if not is_finite(along) or not 0 <= along <= WORST:
+            raise SimulatorError(
+                f"--odometry-noise: expected a number from 0 to {WORST:g}, got {brief(along)}; with 1 the robot is a metre off after one metre"
+            )
+        usual = Odometer()
+        share = along / usual.along
+        return replace(self, along=along, across=usual.across * share, heading=usual.heading * share, turning=usual.turning * share)
+
     def parameters(self) -> dict[str, float]:
         """The noise model by name, as it is written into logs."""
         return asdict(self)
 
     def reading(self, poses: Array, rng: np.random.Generator) -> Array:
         """What the odometer says at each of the true poses (x, y, heading), (n, 3) in metres and radians. It begins at (0, 0, 0)."""
-        steps = np.diff(poses, axis=0)
-        cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
-        ahead, left = cos * steps[:, 0] + sin * steps[:, 1], cos * steps[:, 1] - sin * steps[:, 0]
-        turned = np.remainder(steps[:, 2] + np.pi, 2 * np.pi) - np.pi
+        ahead, left, turned = _motions(poses)
         way = np.hypot(ahead, left)
-        noise = rng.normal(size=(4, len(steps)))
+        noise = rng.normal(size=(4, len(way)))
         told_ahead = (1 + self.scale) * ahead + self.along * np.sqrt(way) * noise[0]
         told_left = (1 + self.scale) * left + self.across * np.sqrt(way) * noise[1]
         told_turn = turned + self.bend * ahead + self.heading * np.sqrt(way) * noise[2] + self.turning * np.sqrt(np.abs(turned)) * noise[3]
@@ -72,3 +79,22 @@ class Odometer:
         x = np.concatenate([[0.0], np.cumsum(cos * told_ahead - sin * told_left)])
         y = np.concatenate([[0.0], np.cumsum(sin * told_ahead + cos * told_left)])
         return np.column_stack([x, y, np.remainder(heading + np.pi, 2 * np.pi) - np.pi])
+
+    def covariances(self, readings: Array) -> Array:
+        """For each reading, (n, 3), the covariance of its noise against the first one, (n, 3, 3), to first order: what a robot can say of its own odometry. The errors that repeat are not in it."""
+        found = np.zeros((len(readings), 3, 3))
+        for number, (start, ahead, left, turned) in enumerate(zip(readings, *_motions(readings), strict=False)):
+            way, cos, sin = np.hypot(ahead, left), np.cos(start[2]), np.sin(start[2])
+            by_pose = np.array([[1.0, 0.0, -sin * ahead - cos * left], [0.0, 1.0, cos * ahead - sin * left], [0.0, 0.0, 1.0]])
+            by_motion = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+            noise = np.diag([self.along**2 * way, self.across**2 * way, self.heading**2 * way + self.turning**2 * abs(turned)])
+            found[number + 1] = by_pose @ found[number] @ by_pose.T + by_motion @ noise @ by_motion.T
+        return found
+
+
+def _motions(poses: Array) -> tuple[Array, Array, Array]:
+    """How far it is ahead and left from each pose to the next, in its frame, and how far that is turned; metres and radians."""
+    steps = np.diff(poses, axis=0)
+    cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    turned = np.remainder(steps[:, 2] + np.pi, 2 * np.pi) - np.pi
+    return cos * steps[:, 0] + sin * steps[:, 1], cos * steps[:, 1] - sin * steps[:, 0], turned

@@ -2,21 +2,41 @@
 
 from __future__ import annotations
 
+import gzip
+import json
 import math
+from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
+from test_plans import SCHOOLS, plan_of, xml
 
+from perception.readers.logs import read_log
+from simulator.buildings import Building
+from simulator.control import Driver
+from simulator.cruise import follow
 from simulator.drive import Recorder
 from simulator.errors import SimulatorError
+from simulator.freespace import FreeSpace
 from simulator.laser import Laser
 from simulator.motion import between
 from simulator.odometer import Odometer
+from simulator.plans import Plan
+from simulator.robot import Body, Robot
+from simulator.rounds import Rooms, Round, holds, record_plan
 from simulator.tours import record
 from simulator.world import World
+from ssh_abduction.cli import main
 
 RECTANGLE = World.named("notched-rectangle")
+
+
+@pytest.fixture
+def ring(tmp_path: Path) -> Building:
+    """Four rooms in a ring, and a closet, each 9.8 m wide."""
+    return Building.of(plan_of(tmp_path, xml()))
 
 
 def steps_of(poses: np.ndarray) -> list[tuple[float, float, float]]:
@@ -82,3 +102,165 @@ def test_a_drive_of_a_world_says_where_the_robot_was() -> None:
     again = record(RECTANGLE, tours=2, seed=1, odometer=Odometer(along=0.2))
     np.testing.assert_array_equal(drive.poses, again.poses)  # noise of the odometer changes the log alone
     assert not np.array_equal(drive.odometry, again.odometry)
+
+
+def test_the_covariance_of_an_odometer_is_that_of_its_errors() -> None:
+    """Along two sides of a square, over many drives: the errors at the end, in the standard deviations that the odometer itself says, are three independent numbers."""
+    rng, odometer = np.random.default_rng(0), Odometer()
+    side = np.column_stack([np.linspace(0, 4, 41), np.zeros((41, 2))])
+    turn = np.column_stack([np.full(11, 4.0), np.zeros(11), np.linspace(0, math.pi / 2, 11)])
+    poses = np.vstack([side, turn, np.column_stack([np.full(41, 4.0), np.linspace(0, 4, 41), np.full(41, math.pi / 2)])])
+    errors = []
+    for _ in range(300):
+        read = odometer.reading(poses, rng)
+        covariance = odometer.covariances(read)[-1]
+        errors.append(np.linalg.solve(np.linalg.cholesky(covariance), read[-1] - poses[-1]))
+    np.testing.assert_allclose(np.mean(errors, axis=0), 0, atol=0.15)
+    np.testing.assert_allclose(np.cov(np.transpose(errors)), np.eye(3), atol=0.3)
+
+
+# Floor plans
+
+
+def test_doors_are_openings_in_the_walls_of_both_rooms(ring: Building) -> None:
+    """The rooms are 0.2 m apart. A laser in the middle of a room sees through its door, and what is beside the door is a wall."""
+    opening = ring.openings[0]
+    assert (*opening.middle, opening.width, opening.depth) == pytest.approx((10.0, -5.0, 1.0, 0.2))
+    assert abs(math.sin(opening.along)) == pytest.approx(1.0)
+    ranges = Laser(reach=30.0).exact(ring.world(), np.array([[5.0, -5.0, 0.0]]))[0]
+    assert ranges[89] > 14  # through the door, and the closet's
+    assert ranges[[80, 99]] == pytest.approx(4.9, abs=0.1)
+    assert holds(ring.plan.rooms[0].polygon, (5.0, -5.0))
+    assert not holds(ring.plan.rooms[0].polygon, (10.0, -5.0))
+
+
+def test_a_robot_drives_through_doors_from_room_to_room(ring: Building) -> None:
+    drive = record_plan(ring.plan, tours=2, seed=3, metres=45.0, body=Body(radius=0.3))
+    world = ring.world()
+    assert min(world.clearance(x, y) for x, y, _ in drive.poses) >= 0.3
+    assert len(drive.truth["scans"]) == len(drive)
+    for pose, room in zip(drive.poses, drive.truth["scans"], strict=True):  # in the room that the truth says, or in the wall between two
+        outline = np.array(ring.plan.rooms[int(room.removeprefix("room "))].polygon)
+        assert (outline.min(0) - 0.6 < pose[:2]).all()
+        assert (pose[:2] < outline.max(0) + 0.6).all()
+    visits = [visit["place"] for visit in drive.truth["visits"]]
+    for before, after, crossing in zip(visits, visits[1:], drive.truth["crossings"], strict=False):
+        door = drive.truth["doors"][crossing["door"]]
+        assert sorted(door["rooms"]) == sorted([before, after])
+        assert math.dist(drive.poses[crossing["scan"]][:2], door["at"]) < 0.8
+    half = len(visits) // 2
+    assert visits[: half + 1] == visits[half:]  # the same round twice, which ends where it began
+    assert set(visits) == {f"room {room}" for room in range(5)}
+    rooms = Rooms(ring, 0.3)
+    rounds = [Round.drawn(rooms, 45.0, np.random.default_rng(seed)).doors for seed in range(5)]
+    assert len(set(rounds)) > 2
+
+
+def test_rounds_that_cannot_be_driven(ring: Building) -> None:
+    for body, what in ((Body(radius=0.6), "through which the robot fits"),):
+        with pytest.raises(SimulatorError, match=what):
+            record_plan(ring.plan, body=body)
+    with pytest.raises(SimulatorError, match="tours: expected 1 or more"):
+        record_plan(ring.plan, tours=0)
+    with pytest.raises(SimulatorError, match="metres: expected a length above 0"):
+        record_plan(ring.plan, metres=0.0)
+    with pytest.raises(SimulatorError, match="room 4: expected a bounding_polygon"):
+        Building.of(replace(ring.plan, rooms=(*ring.plan.rooms[:4], replace(ring.plan.rooms[4], polygon=()))))
+
+
+@pytest.mark.skipif(not SCHOOLS, reason="the school plans are not here")
+def test_a_school_can_be_driven() -> None:
+    """The robot goes through 30 doors of a school, hits nothing, and comes home."""
+    drive = record_plan(Plan.load(next(path for path in SCHOOLS if "Sabadell" in path.name)), seed=0, metres=100.0)
+    assert len(drive.truth["crossings"]) > 10
+    assert drive.truth["scans"][0] == drive.truth["scans"][-1]
+    assert math.dist(drive.poses[0][:2], drive.poses[-1][:2]) < 1.0
+
+
+# Driving around things
+
+
+def test_a_way_leads_around_what_was_not_known() -> None:
+    """A box stands on the midline of a corridor, and no map shows it. The robot drives around it, and goes on along its way."""
+    walls = np.array([[0, 0, 12, 0], [12, 0, 12, 3], [12, 3, 0, 3], [0, 3, 0, 0.0]])
+    box = np.array([[5, 1, 6, 1], [6, 1, 6, 2], [6, 2, 5, 2], [5, 2, 5, 1.0]])
+    space = FreeSpace.of(walls, 0.2)
+    way = space.way((1.0, 1.5), (11.0, 1.5))
+    assert way is not None
+    rng = np.random.default_rng(0)
+    driver = Driver(World("box", np.vstack([walls, box])), Robot(Body(), (1.0, 1.5, 0.0), rng), Laser(), rng)
+    track = []
+    come = []
+    for at in follow(driver, space, way):
+        come.append(at)
+        track.append(driver.robot.pose[:2])
+    assert math.dist(track[-1], (11.0, 1.5)) < 0.3
+    assert come == sorted(come)
+    beside = [abs(y - 1.5) for x, y in track if 5 < x < 6]
+    assert min(beside) > 0.7
+    assert max(abs(y - 1.5) for x, y in track if x < 3 or x > 8) < 0.3
+
+
+def test_a_way_that_is_closed_is_an_error() -> None:
+    walls = np.array([[0, 0, 12, 0], [12, 0, 12, 3], [12, 3, 0, 3], [0, 3, 0, 0.0]])
+    space = FreeSpace.of(walls, 0.2)
+    way = space.way((1.0, 1.5), (11.0, 1.5))
+    assert way is not None
+    rng = np.random.default_rng(0)
+    driver = Driver(World("shut", np.vstack([walls, [[6, 0, 6, 3]]])), Robot(Body(), (1.0, 1.5, 0.0), rng), Laser(), rng)
+    with pytest.raises(SimulatorError, match=r"shut: drive at \(\d\.\d+, 1\.\d+\): expected a way around what stands there, got none"):
+        for _ in follow(driver, space, way):
+            pass
+    part = space.part(np.array([(1.0, 1.5), (11.0, 1.5)]), space.drawn(np.array([[6.0, 0, 6, 3]])))
+    assert part.way((1.0, 1.5), (11.0, 1.5)) is None
+    one, other = part.region(np.array([(1.0, 1.5), (11.0, 1.5)]))
+    assert one != other
+    assert part.nearest(int(one), (11.0, 1.5), 1.0)[0] < 6
+
+
+# The verb
+
+
+def test_simulate_writes_logs_that_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "school.xml").write_text(xml())
+    assert (
+        main(
+            [
+                "simulate",
+                str(tmp_path / "school.xml"),
+                "--as",
+                "carmen",
+                "--scale-error",
+                "0.1",
+                "--every",
+                "2",
+                "-o",
+                str(tmp_path / "run.log.gz"),
+            ]
+        )
+        == 0
+    )
+    said = capsys.readouterr().out
+    log = read_log(tmp_path / "run.log.gz")
+    truth = json.loads((tmp_path / "run.truth.json").read_text())
+    assert f"{len(log):,} scans along {truth['metres']:.0f} m of school" in said
+    assert len(log) == len(truth["scans"]) == len(truth["poses"])
+    assert log.scans[-1].corrected == pytest.approx(truth["poses"][-1], abs=1e-3)
+    assert log.scans[-1].odometry != pytest.approx(truth["poses"][-1], abs=0.1)
+    assert b"PARAM simulator_odometry_scale 0.1 " in gzip.decompress((tmp_path / "run.log.gz").read_bytes())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["school.xml"], "school.xml: expected --as carmen or --as bag beside a floor plan"),
+        (["school.xml", "--as", "carmen", "--reach", "1"], "--reach: expected none beside a floor plan"),
+        (["triangle", "--as", "carmen", "--no-stars"], "--no-stars: expected none beside --as"),
+        (["triangle", "--as", "carmen", "--images", "panoramas"], "--images panoramas: expected none beside --as"),
+        (["triangle", "--as", "carmen", "--every", "0"], "every: expected a number of metres above 0, got 0"),
+        (["triangle", "--as", "carmen", "--odometry-noise", "nan"], "--odometry-noise: expected a number from 0 to 1, got nan"),
+    ],
+)
+def test_logs_that_cannot_be_simulated(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", *arguments, "-o", "run.log"]) == 1
+    assert message in capsys.readouterr().err

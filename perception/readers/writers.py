@@ -24,7 +24,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,15 +46,20 @@ HEADER = (
 # The frames of a bag, by the names that REP 105 gives them.
 MAP, ODOM, BASE, LASER = "map", "odom", "base_link", "laser"
 NANO = 1_000_000_000
+# Where x, y and the turn about z are in a covariance of ROS.
+PLANAR = (0, 1, 5)
 
 
-def write_carmen(path: str | os.PathLike[str], scans: Iterable[Scan]) -> None:
+def write_carmen(path: str | os.PathLike[str], scans: Iterable[Scan], parameters: Mapping[str, float] | None = None) -> None:
     """Write scans as a log of CARMEN, gzipped where the file's name ends in .gz. The file appears whole or not at all.
+
+    parameters  numbers by their names, such as the noise of the odometry, for lines PARAM at the head of the log
 
     A scan is a line ROBOTLASER1, which says how the laser is made and mounted, behind a line ODOM and, where its true pose is known, a line TRUEPOS, as CARMEN's simulator writes.
     Ranges beyond the laser's reach are written as its reach, those that are no measurement as 0. Raises LogError.
     """
-    text = HEADER + "".join(map(_carmen_lines, *_numbered(scans)))
+    head = HEADER + "".join(f"PARAM {name} {value:g} 0 localhost 0\n" for name, value in (parameters or {}).items())
+    text = head + "".join(map(_carmen_lines, *_numbered(scans)))
     data = text.encode("ascii")
     try:
         write_file(path, gzip.compress(data, mtime=0) if os.fspath(path).endswith(".gz") else data)
@@ -64,10 +69,11 @@ def write_carmen(path: str | os.PathLike[str], scans: Iterable[Scan]) -> None:
         ) from None
 
 
-def write_bag(path: str | os.PathLike[str], scans: Iterable[Scan]) -> None:
+def write_bag(path: str | os.PathLike[str], scans: Iterable[Scan], covariances: NDArray[np.float64] | None = None) -> None:
     """Write scans as a ROS bag: a file of ROS 1 where the name ends in .bag, a file of MCAP where it ends in .mcap, else a folder of ROS 2. What is written appears whole or not at all.
 
     Topics: /scan (LaserScan), /odom (Odometry), /tf (from odom to base_link and, where the true poses are known, from map to odom) and /tf_static (from base_link to laser).
+    covariances  for each scan that of its odometry, (n, 3, 3): x, y, heading; zeros, which mean that it is not known, where it is missing
     Raises LogError, also for a folder that is there already, and where the extra `ros` is missing.
     """
     target = Path(path)
@@ -75,7 +81,7 @@ def write_bag(path: str | os.PathLike[str], scans: Iterable[Scan]) -> None:
         raise LogError(f"{named(path)}: expected a folder that is not there yet, got one that is; name another, or remove it")
     try:
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".bag-") as draft:
-            written = _write_bag(Path(draft) / target.name, scans)
+            written = _write_bag(Path(draft) / target.name, scans, covariances)
             if target.is_file() and written.is_dir():
                 raise LogError(
                     f"{named(path)}: expected the name of a folder, got that of a file; name another, or end it in .bag or .mcap"
@@ -112,7 +118,7 @@ def _numbers(pose: Pose) -> str:
     return " ".join(f"{value:.6f}" for value in pose)
 
 
-def _write_bag(path: Path, scans: Iterable[Scan]) -> Path:
+def _write_bag(path: Path, scans: Iterable[Scan], covariances: NDArray[np.float64] | None) -> Path:
     """Write a bag, and say which file or folder of it is to be kept."""
     try:
         from rosbags import rosbag1, rosbag2
@@ -130,12 +136,12 @@ def _write_bag(path: Path, scans: Iterable[Scan]) -> Path:
     serialize = store.serialize_ros1 if is_ros1 else store.serialize_cdr
     with writer:
         topics = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
-        for topic, time, message in _messages(store, scans, is_ros1):
+        for topic, time, message in _messages(store, scans, covariances, is_ros1):
             writer.write(topics[topic], time, serialize(message, kinds[topic]))
     return next(path.glob("*.mcap")) if path.suffix == ".mcap" else path
 
 
-def _messages(store: Any, scans: Iterable[Scan], is_ros1: bool) -> Iterator[tuple[str, int, Any]]:
+def _messages(store: Any, scans: Iterable[Scan], covariances: NDArray[np.float64] | None, is_ros1: bool) -> Iterator[tuple[str, int, Any]]:
     """The messages of all scans: topic, time in nanoseconds, and message."""
     types = store.types
     mounted: set[Pose] = set()
@@ -155,7 +161,7 @@ def _messages(store: Any, scans: Iterable[Scan], is_ros1: bool) -> Iterator[tupl
         yield "/tf", time, make.transform(ODOM, BASE, scan.odometry)
         if scan.corrected is not None:
             yield "/tf", time, make.transform(MAP, ODOM, moved(scan.corrected, between(scan.odometry, (0.0, 0.0, 0.0))))
-        yield "/odom", time, make.odometry(scan.odometry)
+        yield "/odom", time, make.odometry(scan.odometry, np.zeros((3, 3)) if covariances is None else covariances[number])
         yield "/scan", time, make.scan(scan.ranges, laser)
 
 
@@ -174,8 +180,10 @@ class _Maker:
         stamped = self.types[geometry + "TransformStamped"](header=self.header(parent), child_frame_id=child, transform=move)
         return self.types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
 
-    def odometry(self, pose: Pose) -> Any:
+    def odometry(self, pose: Pose, covariance: NDArray[np.float64]) -> Any:
         geometry, unknown = "geometry_msgs/msg/", np.zeros(36)
+        known = np.zeros((6, 6))
+        known[np.ix_(PLANAR, PLANAR)] = covariance
         at = self.types[geometry + "Pose"](
             position=self.types[geometry + "Point"](x=pose[0], y=pose[1], z=0.0), orientation=self.turned(pose[2])
         )
@@ -183,7 +191,7 @@ class _Maker:
         return self.types["nav_msgs/msg/Odometry"](
             header=self.header(ODOM),
             child_frame_id=BASE,
-            pose=self.types[geometry + "PoseWithCovariance"](pose=at, covariance=unknown),
+            pose=self.types[geometry + "PoseWithCovariance"](pose=at, covariance=known.ravel()),
             twist=self.types[geometry + "TwistWithCovariance"](twist=still, covariance=unknown),
         )
 

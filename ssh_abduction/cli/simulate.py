@@ -1,4 +1,4 @@
-"""ssh-abduction simulate WORLD: drive tours, log images, actions and odometry."""
+"""ssh-abduction simulate WORLD: drive tours, and log images, actions and odometry at dstates, or scans all along as real robots do."""
 
 from __future__ import annotations
 
@@ -17,23 +17,41 @@ if TYPE_CHECKING:
     from simulator.panorama import Camera
     from ssh_abduction.trace import Trace
 
+ENDINGS = (".log", ".clf", ".bag", ".mcap")
 SHIPPED = ("notched-rectangle", "taylor-hall", "triangle", "three-ways", "five-ways", "six-ways")
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Drive tours through a world, and log an image, an action and the odometry at each dstate. Views are left to cluster."
+    text = (
+        "Drive tours through a world, and log an image, an action and the odometry at each dstate; views are left to cluster. "
+        "Or, with --as, log scans and odometry all along, as real robots do, and write the truth about places beside the log."
+    )
     parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
-    parser.add_argument("world", help=f"{', '.join(SHIPPED)}, a world file (.json), or an occupancy map (.yaml)")
+    parser.add_argument("world", help=f"{', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or a floor plan (.xml)")
+    parser.add_argument(
+        "--as",
+        dest="log",
+        choices=("carmen", "bag"),
+        help="write a robot's log: lines of CARMEN, or a bag of ROS (.bag, .mcap, or a folder)",
+    )
     parser.add_argument("--tours", type=int, default=1, metavar="N", help="how often the route is driven (default: 1)")
     parser.add_argument("--seed", type=seed, default=0, help="seed of all noise (default: 0)")
     parser.add_argument("--no-stars", action="store_true", help="do not log the openings that the robot sees at each place")
-    parser.add_argument("--every", type=float, metavar="M", help="log an image each so many metres, rather than at dstates")
+    parser.add_argument(
+        "--every",
+        type=float,
+        metavar="M",
+        help="log an image each so many metres, rather than at dstates; with --as a scan (default: 0.25)",
+    )
     parser.add_argument("--start", metavar="X,Y,DEGREES", help="another start than the world's; write --start=-1,2,90")
     parser.add_argument("--route", metavar="ACTIONS", help="another route than the world's; travel, right, left, around with commas")
     parser.add_argument("--reach", type=float, metavar="M", help="metres from a wall at which the robot follows it")
     errors = parser.add_argument_group("odometry", "how wrong the displacements are that the robot logs")
     errors.add_argument(
-        "--odometry-noise", type=float, metavar="SHARE", help="standard deviation, as a share of each motion (default: 0.02)"
+        "--odometry-noise",
+        type=float,
+        metavar="SHARE",
+        help="standard deviation, as a share of each motion (default: 0.02); with --as metres after one metre, the rest in proportion (default: 0.05)",
     )
     errors.add_argument("--scale-error", type=float, default=0.0, metavar="SHARE", help="all ways are reported longer by this (default: 0)")
     errors.add_argument("--bend-error", type=float, default=0.0, metavar="DEGREES", help="drift of the heading in each metre (default: 0)")
@@ -61,6 +79,12 @@ def run(options: argparse.Namespace) -> int:
     from simulator.tours import simulate
     from simulator.world import World
 
+    if options.log:
+        return _write_log(options, _drive(options))
+    if options.world.endswith(".xml"):
+        raise SSHError(
+            f"{named(options.world)}: expected --as carmen or --as bag beside a floor plan, as it has no route of actions; add that"
+        )
     noise = Body.odometry if options.odometry_noise is None else options.odometry_noise
     body = Body(odometry=noise, scale=options.scale_error, bend=math.radians(options.bend_error))
     world = World.named(options.world).with_choices(options.start, options.route, options.reach)
@@ -69,6 +93,63 @@ def run(options: argparse.Namespace) -> int:
     if camera and options.output != "-":
         trace = _with_table(trace, options.output)
     write(trace, options.output, f"{counted(len(trace), 'images')} of {printable(world.name)}")
+    return 0
+
+
+def _drive(options: argparse.Namespace) -> Drive:
+    """The drive that is to be logged as robots do. Raises SSHError."""
+    import math
+
+    from simulator.drive import EVERY
+    from simulator.odometer import Odometer
+    from simulator.plans import Plan
+    from simulator.rounds import record_plan
+    from simulator.tours import record
+    from simulator.world import World
+
+    for name, given in (
+        ("--images panoramas", options.images != "ranges"),
+        ("--no-stars", options.no_stars),
+        ("-o -", options.output == "-"),
+    ):
+        if given:
+            raise SSHError(f"{name}: expected none beside --as, as a robot's log is a file of scans; leave it out")
+    odometer = Odometer(scale=options.scale_error, bend=math.radians(options.bend_error))
+    if options.odometry_noise is not None:
+        odometer = odometer.as_noisy_as(options.odometry_noise)
+    every = EVERY if options.every is None else options.every
+    if not options.world.endswith(".xml"):
+        world = World.named(options.world).with_choices(options.start, options.route, options.reach)
+        return record(world, options.tours, options.seed, odometer=odometer, every=every)
+    for name in ("start", "route", "reach"):
+        if getattr(options, name) is not None:
+            raise SSHError(f"--{name}: expected none beside a floor plan, whose rounds are drawn by --seed; leave it out")
+    return record_plan(Plan.load(options.world), options.tours, options.seed, odometer=odometer, every=every)
+
+
+def _write_log(options: argparse.Namespace, drive: Drive) -> int:
+    """Write a drive as a robot's log, and the truth beside it."""
+    import json
+    from pathlib import Path
+
+    from perception.readers.writers import write_bag, write_carmen
+    from ssh_abduction.files import write_file
+
+    target = Path(options.output)
+    if options.log == "carmen":
+        noise = {f"simulator_odometry_{name}": value for name, value in drive.odometer.parameters().items()}
+        write_carmen(target, scans_of(drive), noise)
+    else:
+        write_bag(target, scans_of(drive), drive.odometer.covariances(drive.odometry))
+    name = target.name.removesuffix(".gz")
+    truth = target.with_name(f"{name if Path(name).suffix not in ENDINGS else Path(name).stem}.truth.json")
+    try:
+        write_file(truth, json.dumps(drive.truth).encode() + b"\n")
+    except OSError as error:
+        raise SSHError(f"{named(truth)}: cannot write the truth: {error.strerror or error}; check the folder") from None
+    print(
+        f"{counted(len(drive), "scans")} along {drive.metres:.0f} m of {printable(drive.name)} in {named(target)}, and the truth in {named(truth)}"
+    )
     return 0
 
 
