@@ -148,7 +148,7 @@ def _write_log(options: argparse.Namespace, drive: Drive) -> int:
     except OSError as error:
         raise SSHError(f"{named(truth)}: cannot write the truth: {error.strerror or error}; check the folder") from None
     print(
-        f"{counted(len(drive), "scans")} along {drive.metres:.0f} m of {printable(drive.name)} in {named(target)}, and the truth in {named(truth)}"
+        f"{counted(len(drive), 'scans')} along {drive.metres:.0f} m of {printable(drive.name)} in {named(target)}, and the truth in {named(truth)}"
     )
     return 0
 
