@@ -1,4 +1,4 @@
-"""Files that nobody has checked yet are read, and files are written so that they appear whole or not at all."""
+"""Files that nobody has checked yet are read, files are written so that they appear whole or not at all, and those that ship are found."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import re
 import stat
 import threading
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,14 @@ def parse_json(text: str) -> Any:
 def json_line(value: Any) -> str:
     """A value as JSON on one line. Characters that would steer a terminal are escaped. Raises TypeError or ValueError."""
     return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", json.dumps(value, ensure_ascii=False, allow_nan=False))
+
+
+@cache
+def shipped(name: str) -> Path:
+    """The folder of this name that ships: inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    packaged = package / name
+    return packaged if packaged.is_dir() else package.parent / name
 
 
 def read_at_most(path: str | os.PathLike[str], most: int) -> bytes:

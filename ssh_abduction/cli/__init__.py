@@ -24,6 +24,7 @@ from ssh_abduction.cli import (
     compare,
     completion,
     evaluate,
+    examples,
     explain,
     export,
     facts,
@@ -121,6 +122,7 @@ def parser() -> argparse.ArgumentParser:
         train,
         view,
         reproduction,
+        examples,
         completion,
     ):
         verb.add_parser(verbs)

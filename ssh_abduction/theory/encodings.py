@@ -6,8 +6,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
+
+from ssh_abduction.files import shipped
 
 FIRST = (
     "causal",
@@ -60,11 +61,9 @@ def _holds(condition: str, choices: Mapping[str, object]) -> bool:
     return any(choices[field] for field in condition.split("|"))
 
 
-@cache
 def folder() -> Path:
     """The folder of the encodings: inside the installed package, or beside it in a checkout."""
-    packaged = Path(str(files("ssh_abduction"))) / "encodings"
-    return packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "encodings"
+    return shipped("encodings")
 
 
 def path(name: str) -> str:
