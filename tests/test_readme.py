@@ -9,12 +9,14 @@ import shlex
 import subprocess
 import sys
 import tomllib
+import warnings
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from ssh_abduction.cli import parser
+from ssh_abduction.cli import main, parser
 from ssh_abduction.picture import svg
 from ssh_abduction.solver.result import Status
 from ssh_abduction.solver.search import solve
@@ -24,7 +26,8 @@ from ssh_abduction.trace import Trace
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
-PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("[!i]*.md"))
+PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCKS = {page: re.findall(r"```(\w*)\n(.*?)```", page.read_text(), re.DOTALL) for page in PAGES}
 # How links of the README begin, which PyPI shows, too: what follows is the path of a file in this checkout.
 ABSOLUTE = (
@@ -39,38 +42,93 @@ FILES = [
 EXAMPLES = {"own.lp", "run.jsonl", "NAME.lp", "NAME.py"}  # files that a reader has, or makes
 
 
-def shown(language: str) -> list[object]:
-    """The blocks of a language that a block of output follows, each with that output and the page as its name."""
-    found = []
-    for page, blocks in BLOCKS.items():
-        for (said, text), (after, output) in pairwise(blocks):
-            if said == language and not after:
-                found.append(pytest.param(text, output, id=f"{page.stem}-{len(found)}"))
-    return found
+@dataclass(frozen=True)
+class Block:
+    """Lines that a page shows, and what it says that they print; None where it does not say. Of lines that are not run `why` says why."""
+
+    language: str
+    lines: str
+    output: str | None
+    why: str
+
+
+def blocks(page: Path) -> list[Block]:
+    """The blocks of a page in Python and for the shell. The output is a block without a language behind them."""
+    found = re.findall(r"(?:<!-- not run: (.+?) -->\n)?```(\w*)\n(.*?)```", page.read_text(), re.DOTALL)
+    return [
+        Block(language, lines, output if not following else None, why)
+        for (why, language, lines), (_, following, output) in pairwise([*found, ("", "end", "")])
+        if language in ("sh", "python")
+    ]
+
+
+RUN = [
+    pytest.param(block, id=f"{page.stem}-{number}")
+    for page in PAGES
+    if page not in TUTORIALS
+    for number, block in enumerate(blocks(page))
+    if not block.why
+]
+
+
+def run(block: Block) -> tuple[str, int]:
+    """What the lines print here, and the exit code."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        if block.language == "python":
+            exec(block.lines, {})
+            return out.getvalue(), 0
+        code = 0
+        for line in block.lines.splitlines():
+            code = run_line(line)
+    return out.getvalue(), code
+
+
+def run_line(line: str) -> int:
+    """Run a line of a shell, and print what it prints; returns the exit code. Where it is a command of ours alone, no process is begun, which saves the time to load all."""
+    command, _, target = re.sub(r"\s+# .*", "", line).partition(" > ")
+    words = shlex.split(command)
+    if words[0] != "ssh-abduction" or set(command) & set("|*$;&"):
+        ours = re.sub(r"(?<![\w/-])ssh-abduction(?= )", f"{shlex.quote(sys.executable)} -m ssh_abduction", line)
+        done = subprocess.run(ours, shell=True, capture_output=True, text=True, check=False)
+        print(done.stdout, end="")
+        return done.returncode
+    with contextlib.redirect_stdout(io.StringIO()) as out, warnings.catch_warnings():
+        warnings.simplefilter("default")
+        code = main(words[1:])
+    if target:
+        Path(target).write_text(out.getvalue(), encoding="utf-8")
+    else:
+        print(out.getvalue(), end="")
+    return code
 
 
 def without_seconds(text: str) -> str:
     return re.sub(r"\d+\.\d\d s", "_ s", text)
 
 
-@pytest.mark.parametrize(("program", "output"), shown("python"))
-def test_the_python_lines_print_what_is_shown(program: str, output: str) -> None:
-    with contextlib.redirect_stdout(io.StringIO()) as out:
-        exec(program, {})
-    assert out.getvalue() == output
+def compare(block: Block) -> None:
+    output, code = run(block)
+    assert code == (1 if block.output and ": error:" in block.output else 0), block.lines
+    assert block.output is None or without_seconds(output) == without_seconds(block.output)
 
 
-@pytest.mark.parametrize(("lines", "output"), shown("sh"))
-def test_the_shell_lines_print_what_is_shown(lines: str, output: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("block", RUN)
+def test_the_lines_print_what_is_shown(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "examples").symlink_to(ROOT / "examples")
-    command = re.sub(r"^ssh-abduction", f"{shlex.quote(sys.executable)} -m ssh_abduction", lines, flags=re.MULTILINE)
-    done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert without_seconds(done.stdout) == without_seconds(output)
-    assert done.returncode == (1 if ": error:" in output else 0)
+    monkeypatch.chdir(tmp_path)
+    compare(block)
+
+
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_the_tutorial_can_be_followed_in_an_empty_folder(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for block in blocks(page):
+        if not block.why:
+            compare(block)
 
 
 def test_what_is_shown_is_run() -> None:
-    assert (len(shown("python")), len(shown("sh"))) == (20, 12)
+    assert len(RUN) > 35
 
 
 def test_the_command_line_knows_all_that_is_shown() -> None:
