@@ -132,6 +132,15 @@ def compare(trace: Trace, theory: Theory, first: int, second: int) -> PairExplan
     return explanation
 
 
+def test_links_that_are_needed_once_more_are_named() -> None:
+    """The axiom at step 5 alone says nothing of steps 0 and 3: it takes the earlier links as well."""
+    trace = Trace.from_steps("baabab", ["left"] * 5)
+    derivation = explain_pair(trace, 0, 3, Theory.causal()).derivation
+    assert derivation is not None
+    check_derivation(derivation, trace, Theory.causal())
+    assert derivation.supposition == "steps 0 and 3 are one dstate"
+
+
 def test_a_long_trace_is_answered_from_few_steps() -> None:
     near = explain_pair(RECTANGLE, 200, 204)
     assert near.verdict is Verdict.DIFFERENT

@@ -9,7 +9,7 @@ step 0 is at a place on the path that steps 1 and 2 define; step 4 would be at a
 
 The set of axioms and steps is smallest in that none of it can be spared. What is concluded from it is found by asking clingo which conclusions hold in all maps
 in which the axioms hold that were named so far: so each line is a consequence, and not only a sentence about an axiom. First all is concluded that holds in every
-map; where that does not settle the pair, the opposite is supposed, and leads to a contradiction.
+map; where that does not settle the pair, or only by several links at once, the opposite is supposed, and leads to a contradiction.
 """
 
 from __future__ import annotations
@@ -238,7 +238,11 @@ class _Argument:
                 known = self._axioms.consequences(_active(placed), assumed, known)
                 self._add(group, known, supposed)
                 if goal in self._born:
-                    return
+                    if len(self._support(goal)[1]) == len(group):
+                        return
+                    # Several links at once lead there: what is supposed can be followed link by link instead.
+                    self._lines, self._born, left = [], {}, list(self._links)
+                    break
 
     def _next(
         self,
@@ -270,11 +274,12 @@ class _Argument:
         goal = None if not last.conclusions else facts.conclusion("one_dstate" if self._one else "two_dstates", *self._pair)
         order: list[clingo.Symbol | None] = []
         premises: dict[clingo.Symbol | None, list[clingo.Symbol]] = {}
+        links: dict[clingo.Symbol | None, tuple[tuple[str, int], ...]] = {}
 
         def visit(conclusion: clingo.Symbol | None) -> None:
             if conclusion in premises:
                 return
-            premises[conclusion] = self._premises(conclusion)
+            premises[conclusion], links[conclusion] = self._support(conclusion)
             for premise in sorted(premises[conclusion], key=lambda premise: facts.read_conclusion(premise)[1]):
                 visit(premise)
             order.append(conclusion)
@@ -283,37 +288,36 @@ class _Argument:
         order.sort(key=lambda conclusion: self._line_of(conclusion).supposed)  # what holds in every map comes first
         # Conclusions that follow from the same links and premises are one line.
         numbers: dict[clingo.Symbol | None, int] = {}
-        lines: list[tuple[list[clingo.Symbol | None], tuple[int, ...], _Line]] = []
+        lines: list[tuple[list[clingo.Symbol | None], tuple[int, ...], tuple[tuple[str, int], ...]]] = []
         for conclusion in order:
-            line = self._line_of(conclusion)
             before = tuple(sorted({numbers[p] for p in premises[conclusion] if p in numbers}))
-            if lines and lines[-1][2] is line and lines[-1][1] == before:
+            if lines and lines[-1][1:] == (before, links[conclusion]) and self._line_of(lines[-1][0][0]) is self._line_of(conclusion):
                 lines[-1][0].append(conclusion)
             else:
-                lines.append(([conclusion], before, line))
+                lines.append(([conclusion], before, links[conclusion]))
             numbers[conclusion] = len(lines) - 1
         inferences = tuple(self._inference(*told) for told in lines)
-        return inferences, self._summary(goal, premises, lines)
+        return inferences, self._summary(goal, premises, links)
 
     def _line_of(self, conclusion: clingo.Symbol | None) -> _Line:
         return self._lines[-1 if conclusion is None else self._born[conclusion]]
 
-    def _premises(self, conclusion: clingo.Symbol | None) -> list[clingo.Symbol]:
-        """What has to be known besides its links for a conclusion to follow: none of it can be spared."""
+    def _support(self, conclusion: clingo.Symbol | None) -> tuple[list[clingo.Symbol], tuple[tuple[str, int], ...]]:
+        """What a conclusion follows from: what has to be known, none of which can be spared, and links; those of its line, and earlier ones that are needed once more."""
         line = self._line_of(conclusion)
         number = len(self._lines) - 1 if conclusion is None else self._born[conclusion]
         known = [
             (symbol, True) for symbol, born in self._born.items() if born < number and (line.supposed or not self._lines[born].supposed)
         ]
         known.sort(key=lambda assumption: self._rank(assumption[0]))
-        assumed = [(conclusion, False)] if conclusion is not None else []
-        supposed = [self._supposed] if line.supposed else []
-        core = self._axioms.core(_active(line.group), [*assumed, *supposed, *known])
-        if core is None:  # the links of earlier lines are needed once more
-            core = self._axioms.core(
-                _active([link for earlier in self._lines[: number + 1] for link in earlier.group]), [*assumed, *supposed, *known]
-            )
-        return [symbol for symbol, _ in core or () if symbol in self._born and symbol != conclusion]
+        earlier = [link for before in self._lines[:number] for link in before.group]
+        given = [*([(conclusion, False)] if conclusion is not None else []), *([self._supposed] if line.supposed else []), *known]
+        core = self._axioms.core(_active(line.group), given)
+        if core is None:
+            core = self._axioms.core(_active(line.group), [*given, *((facts.active(*link), True) for link in earlier)])
+        needed = {symbol for symbol, _ in core or ()}
+        again = tuple(link for link in earlier if facts.active(*link) in needed)
+        return [symbol for symbol, _ in core or () if symbol in self._born and symbol != conclusion], again + line.group
 
     def _rank(self, symbol: clingo.Symbol) -> tuple[bool, bool, int, int, tuple[int, ...]]:
         """Premises of lower rank are kept. What holds in every map is said of the first step of the pair, what is supposed of the second one."""
@@ -330,13 +334,16 @@ class _Argument:
 
     # Words
 
-    def _inference(self, conclusions: Sequence[clingo.Symbol | None], premises: tuple[int, ...], line: _Line) -> Inference:
+    def _inference(
+        self, conclusions: Sequence[clingo.Symbol | None], premises: tuple[int, ...], needed: Sequence[tuple[str, int]]
+    ) -> Inference:
+        line = self._line_of(conclusions[0])
         known = [symbol for symbol, born in self._born.items() if born <= self._lines.index(line)]
         self._words.know(known)
         said = [facts.read_conclusion(c) for c in conclusions if c is not None]
         says = tuple(dict.fromkeys(self._words.of(c, would=line.supposed) for c in said)) or ("that is a contradiction",)
-        because = tuple(dict.fromkeys(self._words.reason(axiom, t, said, self._pair) for axiom, t in line.group))
-        links = _clashes((axiom, self._piece.steps[t]) for axiom, t in line.group)
+        because = tuple(dict.fromkeys(self._words.reason(axiom, t, said, self._pair) for axiom, t in needed))
+        links = _clashes((axiom, self._piece.steps[t]) for axiom, t in needed)
         return Inference(
             says, because or ("by what is supposed" if line.supposed else "by the trace alone",), links, premises, line.supposed
         )
@@ -345,7 +352,7 @@ class _Argument:
         self,
         goal: clingo.Symbol | None,
         premises: dict[clingo.Symbol | None, list[clingo.Symbol]],
-        lines: Sequence[tuple[list[clingo.Symbol | None], tuple[int, ...], _Line]],
+        links: dict[clingo.Symbol | None, tuple[tuple[str, int], ...]],
     ) -> str:
         """The last step of the argument that rests on two things or more, and the axiom that it rests on."""
         conclusion = goal
@@ -354,7 +361,6 @@ class _Argument:
         self._words.know(self._born)
         if not premises[conclusion]:
             conclusion = goal
-        line = self._line_of(conclusion)
         obvious = (self._pair, ("one_place", "one_dstate", "two_dstates"))  # by what is supposed
         told = [
             self._words.of(facts.read_conclusion(p), would=self._lines[self._born[p]].supposed)
@@ -362,7 +368,7 @@ class _Argument:
             if not (facts.read_conclusion(p)[1] == obvious[0] and facts.read_conclusion(p)[0] in obvious[1])
         ]
         said = [] if conclusion is None else [facts.read_conclusion(conclusion)]
-        reasons = [self._words.reason(axiom, t, said, self._pair, short=True) for axiom, t in line.group]
+        reasons = [self._words.reason(axiom, t, said, self._pair, short=True) for axiom, t in links[conclusion]]
         return _that_path("; ".join(dict.fromkeys([*told, *reasons])))
 
     # Is each link needed?
@@ -433,11 +439,12 @@ class _Words:
             return sentence
         if axiom in OF_ACTIONS and t and (action := self._piece.trace.steps[t - 1].action):
             return f"{sentence}, and the action of step {steps[t - 1]} is {action.name!r}"
-        about = [s for name, s in said if name in ("one_dstate", "two_dstates", "two_places", "one_place")] or [tuple(sorted(pair))]
-        i, j = about[0][:2]
+        pairs = [s for name, s in said if name in ("one_dstate", "two_dstates", "two_places", "one_place")] or [tuple(sorted(pair))]
+        i, j = next((s for s in pairs if t in s), pairs[0])[:2]
         if axiom == "functional_view":
             seen = self._piece.trace.views
-            return f"{sentence}, and step {steps[i]} sees {seen[i]!r}, step {steps[j]} sees {seen[j]!r}"
+            named = (i, j) if t in (i, j) and seen[i] != seen[j] else (t,)
+            return f"{sentence}, and {', '.join(f'step {steps[k]} sees {seen[k]!r}' for k in named)}"
         if axiom == "one_pose" and (
             apart := why_apart(self._trace, steps[i], steps[j], self._piece.theory.replace(same=(), different=(), elsewhere=()))
         ):
