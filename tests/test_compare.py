@@ -522,3 +522,12 @@ def test_one_map_has_nothing_to_be_told_apart_from() -> None:
     found = compare(solve(written("a T b")))
     assert (found.sentence, found.choices, found.deciding, found.product) == ("1 minimal map", (), (), "")
     assert list(compared(found)) == []
+
+
+def test_dstates_along_no_path_are_no_contradiction() -> None:
+    """Steps that are one dstate in the maps listed only, and along no path: their paths are not one in any map."""
+    trace = Trace.from_steps("bbaabaa", ["travel", "left", "left", "left", "around", "around"])
+    cut = compare(solve(trace, maps=2, limit=30))
+    assert cut.complete is False
+    assert cut.shared.proven
+    assert cut.shared.sentence == compare(solve(trace, maps=0)).shared.sentence

@@ -418,14 +418,19 @@ def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> Non
         return
     for sort, told in shared.sorts.items():
         seen = listed.sorts.get(sort)
-        if seen is not None and (wrong := _contradiction(told, seen)):
+        # Steps of one dstate have one number even where they are along no path, which says nothing of other maps.
+        in_one = listed.dstates.always if sort in ("paths", "courses") else range(listing.steps)
+        if seen is not None and (wrong := _contradiction(told, seen, in_one)):
             first, later = wrong
             mend = "the file was changed by hand, or its maps are of another search: solve again"
             raise MapError(f"{listing.source}: backbone: {sort}: steps {first} and {later} are not as the maps listed have them; {mend}")
 
 
-def _contradiction(told: Shared, seen: Shared) -> tuple[int, int] | None:
-    """Two steps that are one in all maps, as is told, and not in all that are seen; or one in no map, as is told, and in some that are seen."""
+def _contradiction(told: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[int, int] | None:
+    """Two steps that are one in all maps, as is told, and not in all that are seen; or one in no map, as is told, and in some that are seen.
+
+    in_one  a number for each step; of two steps with the same number the latter is not asked
+    """
     first_of: dict[int, int] = {}
     for t, number in enumerate(told.always):
         first = first_of.setdefault(number, t)
@@ -434,7 +439,8 @@ def _contradiction(told: Shared, seen: Shared) -> tuple[int, int] | None:
     if told.untold:
         return None
     may_be = {(told.always[i], told.always[j]) for i, j in told.sometimes}
-    one = [*seen.sometimes, *((seen.always.index(number), t) for t, number in enumerate(seen.always))]
+    firsts = ((seen.always.index(number), t) for t, number in enumerate(seen.always))
+    one = [*seen.sometimes, *((first, t) for first, t in firsts if in_one[first] != in_one[t])]
     for i, j in one:
         pair = told.always[i], told.always[j]
         if (pair[0] != pair[1] or i == j != seen.always.index(seen.always[i])) and pair not in may_be and pair[::-1] not in may_be:
