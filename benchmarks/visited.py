@@ -12,7 +12,7 @@ import argparse
 import json
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,8 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from skeleton import poses_of
 
 from perception.readers.logs import read_log
-from ssh_abduction import DState, SSHMap, Trace
-from ssh_abduction.evaluation import Evaluation, MapVisits, VisitsEvaluation, evaluate, evaluate_visits
+from ssh_abduction import Action, DState, SSHMap, Step, Trace
+from ssh_abduction.evaluation import Evaluation, Relations, VisitsEvaluation, evaluate, evaluate_visits
 
 Array = NDArray[np.float64]
 # A robot visits a place when it comes so near to it, in metres. In ACES3, anything from 1.5 to 6 m makes the same 15 visits.
@@ -56,6 +56,7 @@ class Truth:
     doors   where the doors are: x and y by name
     rooms   the room in which each scan was taken; empty where nobody knows
     grid    whether places are at crossings of the grid of ACES3, whose corridors are the true paths
+    times   of the scans, in seconds, and relative poses between times that were checked by hand, where there are any
     """
 
     poses: Array
@@ -63,6 +64,8 @@ class Truth:
     doors: Mapping[str, Sequence[float]] | None = None
     rooms: tuple[str | None, ...] = ()
     grid: bool = False
+    times: tuple[float | None, ...] = ()
+    relations: Relations | None = None
 
     @staticmethod
     def of_aces(poses: Array) -> Truth:
@@ -145,6 +148,7 @@ class Figures:
     precision, recall  of events: of its events, the share that is a true visit; of the true visits, the share that has an event. None where true visits are not known
     named      accuracy, edges and pairs by the names of the true places, in the terms of `evaluate`
     posed      pairs of events by poses, in the terms of `evaluate`
+    related    the same by hand-checked relations, where there are any
     """
 
     nodes: int
@@ -153,15 +157,29 @@ class Figures:
     recall: float | None
     named: Evaluation
     posed: VisitsEvaluation
-
-    @property
-    def places(self) -> MapVisits:
-        return self.posed.maps[0]
+    related: VisitsEvaluation | None
 
     @property
     def isomorphic(self) -> bool:
         """Whether its places are what was visited: each event is a true visit and the other way round, where these are known, and places are told apart rightly."""
         return bool(self.named.maps[0].places_right) and self.precision in (None, 1.0) and self.recall in (None, 1.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures under short names, None where they cannot be said."""
+        named, row = (
+            self.named.maps[0],
+            {"nodes": self.nodes, "events": self.events, "event_precision": self.precision, "event_recall": self.recall},
+        )
+        row |= {
+            "accuracy": named.accuracy,
+            "edge_precision": named.edge_precision,
+            "edge_recall": named.edge_recall,
+            "isomorphic": self.isomorphic,
+        }
+        for judge in (self.posed, self.related):
+            if judge is not None and (pairs := judge.maps[0].places) is not None:
+                row[judge.judge] = {**pairs.to_dict(), **asdict(judge.places)}
+        return row
 
 
 def judged(events: Events, truth: Truth) -> Figures:
@@ -170,25 +188,26 @@ def judged(events: Events, truth: Truth) -> Figures:
     hits = sum(visit is not None for visit in matched)
     names = truth.names(events.scans)
     numbers = {place: i for i, place in enumerate(dict.fromkeys(events.places))}
-    said = Trace.from_steps("v" * len(names), ["travel"] * (len(names) - 1))
+    # A trace of places alone, and a map of it in which each place has one dstate. So accuracy is that of places.
     steps = [
-        replace(step, truth={"place": name, "pose": truth.poses[scan].tolist()})
-        for step, name, scan in zip(said.steps, names, events.scans, strict=True)
+        Step(
+            "v",
+            truth={"dstate": name, "place": name, "pose": truth.poses[scan].tolist()},
+            extra={"time": truth.times[scan] if truth.times else None},
+        )
+        for name, scan in zip(names, events.scans, strict=True)
     ]
-    trace = replace(said, steps=tuple(steps))
-    # A map of places alone: each has one dstate. So accuracy is that of places.
+    trace = Trace((*(replace(step, action=Action.of("travel")) for step in steps[:-1]), steps[-1]))
     dstates = tuple(DState(i, "v", i, None, None) for i in range(len(numbers)))
     ssh_map = SSHMap(tuple(numbers[place] for place in events.places), dstates, (), tuple(range(len(numbers))))
-    by_name = replace(
-        trace, steps=tuple(replace(step, truth={"dstate": step.truth["place"], "place": step.truth["place"]}) for step in steps)
-    )
     return Figures(
         nodes=len(numbers),
         events=len(names),
         precision=hits / len(names) if truth.visits else None,
         recall=hits / len(truth.visits) if truth.visits else None,
-        named=evaluate([ssh_map], by_name),
+        named=evaluate([ssh_map], trace),
         posed=evaluate_visits([ssh_map], trace),
+        related=truth.relations and evaluate_visits([ssh_map], trace, relations=truth.relations),
     )
 
 
@@ -239,11 +258,15 @@ def main() -> None:
 
 
 def truth_of(log: Path, truth: Path | None = None) -> Truth:
-    """The truth of a log: what the simulator says, or its corrected poses; of ACES3 also the visits to its nine places."""
+    """The truth of a log: what the simulator says, or its corrected poses; of ACES3 also the visits to its nine places, of Freiburg the relations beside it."""
     if truth is not None:
         return Truth.load(truth)
-    poses = np.array(poses_of(read_log(str(log)), "corrected"))
-    return Truth.of_aces(poses) if log.name.startswith("aces") else Truth(poses)
+    read = read_log(str(log))
+    poses = np.array(poses_of(read, "corrected"))
+    if log.name.startswith("aces"):
+        return Truth.of_aces(poses)
+    relations = log.with_suffix(".relations")
+    return Truth(poses, times=tuple(scan.time for scan in read.scans), relations=Relations.load(relations) if relations.exists() else None)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,161 @@
+"""Maps of whole logs, beside the skeleton of the metric map, under the same measures: tables in Markdown.
+
+    python benchmarks/logs.py LOG [LOG ...] --out rows.jsonl [--runs FOLDER] [--page docs/logs.md]
+
+Each log is mapped by `ssh-abduction map`, and its events and the first of its maps are judged; then by the skeleton of a grid of its scans at their corrected poses, which a robot does not have, and by that of a grid at the
+poses of its odometry, which is what a robot has that maps nothing. A log NAME.log with NAME.truth.json beside it is a simulated one, and judged by that. Rows that are in the file of rows already are not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+from pages import print_rows
+from skeleton import poses_of, skeleton_of
+from visited import Events, Truth, judged, truth_of
+
+from perception.readers.logs import read_log
+from ssh_abduction import Trace
+from ssh_abduction.maps import maps_of, read_json
+
+METHODS = ("ssh-abduction", "skeleton, corrected poses", "skeleton, odometry")
+HEAD = (
+    "| log | mapper | places | events | events: precision, recall | accuracy | edges: precision, recall | pairs: joined, returns | pairs: precision, recall | CPU s |",
+    "|---|---|---|---|---|---|---|---|---|---|",
+)
+SIMULATED = (
+    "| mapper | logs | mapped | isomorphic | places, median | accuracy, median | edges: precision, recall, medians | pairs: precision, recall, of all logs |",
+    "|---|---|---|---|---|---|---|---|",
+)
+
+
+def name_of(log: Path) -> str:
+    return log.name.partition(".")[0].removesuffix("-corrected")
+
+
+def sidecar(log: Path) -> Path | None:
+    """What the simulator wrote beside a log, if it did."""
+    beside = log.with_name(f"{name_of(log)}.truth.json")
+    return beside if beside.exists() else None
+
+
+def by_skeleton(log: Path, kind: str) -> Events:
+    read = read_log(str(log))
+    poses = poses_of(read, kind)
+    passed = skeleton_of(read, poses).events(poses)
+    return Events(tuple(scan for scan, _ in passed), tuple(node for _, node in passed))
+
+
+def by_map(log: Path, runs: Path) -> Events:
+    """The events and the first map of `ssh-abduction map`, which is run unless its folder is there. Raises OSError and ValueError where there is no map."""
+    folder = runs / name_of(log)
+    if not (folder / "maps.json").exists():
+        subprocess.run([sys.executable, "-m", "ssh_abduction", "map", str(log), "-o", str(folder)], check=True, capture_output=True)
+    maps = maps_of(read_json(folder / "maps.json"), str(folder / "maps.json"))
+    if not maps:
+        raise ValueError(f"{folder}: expected a map, got none")
+    return Events.of(Trace.load(folder / "trace.jsonl"), maps[0])
+
+
+def row_of(log: Path, method: str, truth: Truth, runs: Path) -> dict[str, Any]:
+    row = {"log": name_of(log), "method": method, "simulated": sidecar(log) is not None}
+    began = process_time()
+    try:
+        events = by_map(log, runs) if method == METHODS[0] else by_skeleton(log, "corrected" if "corrected" in method else "odometry")
+    except subprocess.CalledProcessError as error:
+        return row | {"failed": error.stderr.decode(errors="replace").strip().rpartition("\n")[2]}
+    except (OSError, ValueError) as error:
+        return row | {"failed": str(error)}
+    return row | {"seconds": process_time() - began, **judged(events, truth).to_dict()}
+
+
+def shown(*values: float | None) -> str:
+    return ", ".join("–" if value is None else f"{value:.2f}" for value in values)
+
+
+def lines_of(row: dict[str, Any]) -> Iterator[str]:
+    """A row of the table of real logs, and one more for pairs by relations."""
+    if "failed" in row:
+        yield f"| {row['log']} | {row['method']} | {row['failed']} | | | | | | | |"
+        return
+    pairs = row["poses"]
+    cells = [
+        row["log"],
+        row["method"],
+        row["nodes"],
+        row["events"],
+        shown(row["event_precision"], row["event_recall"]),
+        shown(row["accuracy"]),
+    ]
+    cells += [
+        shown(row["edge_precision"], row["edge_recall"]),
+        f"{pairs['joined']}, {pairs['returns']}",
+        shown(pairs["precision"], pairs["recall"]),
+    ]
+    yield "| " + " | ".join(map(str, [*cells, "–" if row["method"] == METHODS[0] else f"{row['seconds']:.1f}"])) + " |"
+    if (pairs := row.get("relations")) is not None:
+        yield f"| by relations | {row['method']} | | | | | | {pairs['joined']}, {pairs['returns']} | {shown(pairs['precision'], pairs['recall'])} | |"
+
+
+def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
+    """What came of all simulated logs by one method."""
+    done = [row for row in rows if "failed" not in row]
+    if not done:
+        return f"| {method} | {len(rows)} | 0 | 0 | | | | |"
+
+    def median(name: str) -> float | None:
+        return statistics.median([row[name] for row in done if row[name] is not None] or [0])
+
+    joined, right, returns = (sum(row["poses"][name] for row in done) for name in ("joined", "right", "returns"))
+    cells = [method, len(rows), len(done), sum(row["isomorphic"] for row in done), median("nodes"), shown(median("accuracy"))]
+    cells += [
+        shown(median("edge_precision"), median("edge_recall")),
+        shown(right / joined if joined else None, right / returns if returns else None),
+    ]
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("logs", nargs="*", type=Path, metavar="LOG")
+    parser.add_argument("--out", type=Path, required=True, metavar="JSONL", help="file of rows, to which new ones are added")
+    parser.add_argument(
+        "--runs",
+        type=Path,
+        default=Path("runs"),
+        metavar="FOLDER",
+        help="where map writes a folder for each log, or has written it (default: runs)",
+    )
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS, help="which mappers (default: all)")
+    parser.add_argument("--page", type=Path, help="write the tables into this page, too")
+    options = parser.parse_args()
+    rows = [json.loads(line) for line in options.out.read_text().splitlines()] if options.out.exists() else []
+    known = {(row["log"], row["method"]) for row in rows}
+    for log in options.logs:
+        wanted = [method for method in options.methods if (name_of(log), method) not in known]
+        truth = truth_of(log, sidecar(log)) if wanted else None
+        for method in wanted:
+            assert truth is not None
+            rows.append(row_of(log, method, truth, options.runs))
+            with options.out.open("a") as file:
+                print(json.dumps(rows[-1]), file=file)
+    real = sorted((row for row in rows if not row["simulated"]), key=lambda row: (row["log"], METHODS.index(row["method"])))
+    print_rows([*HEAD, *(line for row in real for line in lines_of(row))], options.page, r"\| log \| mapper")
+    simulated = [row for row in rows if row["simulated"]]
+    if simulated:
+        by_method = [[row for row in simulated if row["method"] == method] for method in METHODS]
+        print_rows(
+            [*SIMULATED, *(simulated_line(rows[0]["method"], rows) for rows in by_method if rows)], options.page, r"\| mapper \| logs"
+        )
+
+
+if __name__ == "__main__":
+    main()
