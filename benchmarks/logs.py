@@ -1,8 +1,8 @@
 """Maps of whole logs, beside the skeleton of the metric map, under the same measures: tables in Markdown.
 
-    python benchmarks/logs.py LOG [LOG ...] --out rows.jsonl [--runs FOLDER] [--page docs/logs.md]
+    python benchmarks/logs.py [LOG ...] [--plans FOLDER] --out rows.jsonl [--runs FOLDER] [--page docs/logs.md]
 
-Each log is mapped by `ssh-abduction map`, and its events and the first of its maps are judged; then by the skeleton of a grid of its scans at their corrected poses, which a robot does not have, and by that of a grid at the
+With --plans a robot is simulated in each floor plan of a folder, a drive for each seed, and its logs are mapped like others. Each log is mapped by `ssh-abduction map`, and its events and the first of its maps are judged; then by the skeleton of a grid of its scans at their corrected poses, which a robot does not have, and by that of a grid at the
 poses of its odometry, which is what a robot has that maps nothing. A log NAME.log with NAME.truth.json beside it is a simulated one, and judged by that. Rows that are in the file of rows already are not made again.
 """
 
@@ -14,6 +14,7 @@ import statistics
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from itertools import chain, product
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -32,8 +33,8 @@ HEAD = (
     "|---|---|---|---|---|---|---|---|---|---|",
 )
 SIMULATED = (
-    "| mapper | logs | mapped | isomorphic | places, median | accuracy, median | edges: precision, recall, medians | pairs: precision, recall, of all logs |",
-    "|---|---|---|---|---|---|---|---|",
+    "| mapper | logs | mapped | isomorphic | places right | stays in rooms noticed | places, median | accuracy, median | edges: precision, recall, medians | pairs: precision, recall, of all logs |",
+    "|---|---|---|---|---|---|---|---|---|---|",
 )
 
 
@@ -45,6 +46,17 @@ def sidecar(log: Path) -> Path | None:
     """What the simulator wrote beside a log, if it did."""
     beside = log.with_name(f"{name_of(log)}.truth.json")
     return beside if beside.exists() else None
+
+
+def driven(plans: Path, seeds: int, runs: Path) -> Iterator[Path]:
+    """A log for each floor plan of a folder and each seed from 1, made unless it is there: rounds of 200 m by the simulator's own odometer."""
+    runs.mkdir(parents=True, exist_ok=True)
+    for plan, seed in product(sorted(plans.glob("*.xml")), range(1, seeds + 1)):
+        log = runs / f"{plan.stem.removesuffix('_updated')}-{seed}.log"
+        if not log.exists():
+            command = [sys.executable, "-m", "ssh_abduction", "simulate", str(plan), "--as", "carmen", "--seed", str(seed), "-o", str(log)]
+            subprocess.run(command, check=True, capture_output=True)
+        yield log
 
 
 def by_skeleton(log: Path, kind: str) -> Events:
@@ -109,13 +121,14 @@ def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
     """What came of all simulated logs by one method."""
     done = [row for row in rows if "failed" not in row]
     if not done:
-        return f"| {method} | {len(rows)} | 0 | 0 | | | | |"
+        return f"| {method} | {len(rows)} | 0 | 0 | 0 | | | | | |"
 
     def median(name: str) -> float | None:
         return statistics.median([row[name] for row in done if row[name] is not None] or [0])
 
     joined, right, returns = (sum(row["poses"][name] for row in done) for name in ("joined", "right", "returns"))
-    cells = [method, len(rows), len(done), sum(row["isomorphic"] for row in done), median("nodes"), shown(median("accuracy"))]
+    cells = [method, len(rows), len(done), sum(row["isomorphic"] for row in done), sum(row["places_right"] for row in done)]
+    cells += [shown(statistics.mean(row["event_recall"] for row in done)), median("nodes"), shown(median("accuracy"))]
     cells += [
         shown(median("edge_precision"), median("edge_recall")),
         shown(right / joined if joined else None, right / returns if returns else None),
@@ -126,6 +139,8 @@ def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("logs", nargs="*", type=Path, metavar="LOG")
+    parser.add_argument("--plans", type=Path, metavar="FOLDER", help="floor plans (.xml) to simulate drives in")
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="drives through each plan (default: 5)")
     parser.add_argument("--out", type=Path, required=True, metavar="JSONL", help="file of rows, to which new ones are added")
     parser.add_argument(
         "--runs",
@@ -139,7 +154,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = [json.loads(line) for line in options.out.read_text().splitlines()] if options.out.exists() else []
     known = {(row["log"], row["method"]) for row in rows}
-    for log in options.logs:
+    for log in chain(options.logs, driven(options.plans, options.seeds, options.runs) if options.plans else ()):
         wanted = [method for method in options.methods if (name_of(log), method) not in known]
         truth = truth_of(log, sidecar(log)) if wanted else None
         for method in wanted:

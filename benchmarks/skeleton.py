@@ -245,7 +245,8 @@ def _merged(graph: nx.MultiGraph) -> nx.MultiGraph:
             merged.add_node(node, cell=node, clear=graph.nodes[node]["clear"])
     for a, b, data in graph.edges(data=True):
         if home[a] != home[b] or not near.has_edge(a, b):
-            merged.add_edge(home[a], home[b], **data)
+            cells = data["cells"] if data["cells"][0] == a else data["cells"][::-1]
+            _join(merged, [home[a], *cells, home[b]])
     return merged
 
 

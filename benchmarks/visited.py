@@ -53,6 +53,7 @@ class Truth:
 
     poses   (n, 3): where each scan was taken; metres and radians
     visits  to the places that a mapper should find, in order; empty where nobody knows which these are
+    stays   in rooms, in order, where nobody knows at which places in a room a mapper should find itself: it should do so somewhere in each
     doors   where the doors are: x and y by name
     rooms   the room in which each scan was taken; empty where nobody knows
     grid    whether places are at crossings of the grid of ACES3, whose corridors are the true paths
@@ -61,6 +62,7 @@ class Truth:
 
     poses: Array
     visits: tuple[Visit, ...] = ()
+    stays: tuple[Visit, ...] = ()
     doors: Mapping[str, Sequence[float]] | None = None
     rooms: tuple[str | None, ...] = ()
     grid: bool = False
@@ -80,11 +82,9 @@ class Truth:
     def load(path: Path) -> Truth:
         """What the simulator wrote beside a log."""
         told = json.loads(path.read_text())
-        poses = np.array(told["poses"])
+        poses, visits = np.array(told["poses"]), tuple(Visit(visit["place"], visit["first"], visit["last"]) for visit in told["visits"])
         doors = {name: door["at"] for name, door in told.get("doors", {}).items()}
-        if not doors:
-            return Truth(poses, tuple(Visit(visit["place"], visit["first"], visit["last"]) for visit in told["visits"]))
-        return Truth(poses, doors=doors, rooms=tuple(told["scans"]))
+        return Truth(poses, stays=visits, doors=doors, rooms=tuple(told["scans"])) if doors else Truth(poses, visits)
 
     def matched(self, scans: Sequence[int]) -> list[int | None]:
         """For each event the visit that it is at; of several events at one visit, the one nearest to its middle. None where it is at none."""
@@ -145,7 +145,7 @@ class Figures:
     """How right a mapper is.
 
     nodes      how many places it has, of those that were visited
-    precision, recall  of events: of its events, the share that is a true visit; of the true visits, the share that has an event. None where true visits are not known
+    precision, recall  of events: of its events, the share that is a true visit; of the true visits, or else of the stays in rooms, the share that has an event. None where these are not known
     named      accuracy, edges and pairs by the names of the true places, in the terms of `evaluate`
     posed      pairs of events by poses, in the terms of `evaluate`
     related    the same by hand-checked relations, where there are any
@@ -161,7 +161,7 @@ class Figures:
 
     @property
     def isomorphic(self) -> bool:
-        """Whether its places are what was visited: each event is a true visit and the other way round, where these are known, and places are told apart rightly."""
+        """Whether its places are what was visited: they are told apart rightly, and each event is a true visit and the other way round, as far as true visits are known."""
         return bool(self.named.maps[0].places_right) and self.precision in (None, 1.0) and self.recall in (None, 1.0)
 
     def to_dict(self) -> dict[str, Any]:
@@ -171,6 +171,7 @@ class Figures:
             {"nodes": self.nodes, "events": self.events, "event_precision": self.precision, "event_recall": self.recall},
         )
         row |= {
+            "places_right": named.places_right,
             "accuracy": named.accuracy,
             "edge_precision": named.edge_precision,
             "edge_recall": named.edge_recall,
@@ -184,8 +185,8 @@ class Figures:
 
 def judged(events: Events, truth: Truth) -> Figures:
     """How right these events are."""
-    matched = truth.matched(events.scans)
-    hits = sum(visit is not None for visit in matched)
+    hits = sum(visit is not None for visit in truth.matched(events.scans))
+    noticed = sum(any(stay.first <= scan <= stay.last for scan in events.scans) for stay in truth.stays)
     names = truth.names(events.scans)
     numbers = {place: i for i, place in enumerate(dict.fromkeys(events.places))}
     # A trace of places alone, and a map of it in which each place has one dstate. So accuracy is that of places.
@@ -204,7 +205,7 @@ def judged(events: Events, truth: Truth) -> Figures:
         nodes=len(numbers),
         events=len(names),
         precision=hits / len(names) if truth.visits else None,
-        recall=hits / len(truth.visits) if truth.visits else None,
+        recall=hits / len(truth.visits) if truth.visits else noticed / len(truth.stays) if truth.stays else None,
         named=evaluate([ssh_map], trace),
         posed=evaluate_visits([ssh_map], trace),
         related=truth.relations and evaluate_visits([ssh_map], trace, relations=truth.relations),
