@@ -167,10 +167,9 @@ def opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
         if kind not in store.fielddefs:
             store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
     with tempfile.TemporaryDirectory() as folder:
-        reader: Any = None
+        file = _with_suffix(Path(path), Path(folder))
         try:
-            file = _with_suffix(Path(path), Path(folder))
-            reader = rosbag1.Reader(file) if is_ros1 else rosbag2.Reader(file)
+            reader: Any = rosbag1.Reader(file) if is_ros1 else rosbag2.Reader(file)
             reader.open()
         except Exception as error:  # whatever a library runs into in damaged bytes
             raise LogError(
@@ -183,13 +182,15 @@ def opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
 
 
 def _with_suffix(path: Path, folder: Path) -> Path:
-    """The path under a name from which rosbags knows what it is, whatever the file is called."""
+    """The path under a name from which rosbags knows what it is, whatever the file is called. Raises LogError for a folder that is no bag."""
     if path.is_dir():
         if (path / "metadata.yaml").exists():
             return path
         inside = sorted((*path.glob("*.mcap"), *path.glob("*.db3")))
         if len(inside) != 1:
-            raise LogError(f"no metadata.yaml in the folder, and {len(inside)} files *.mcap or *.db3")
+            raise LogError(
+                f"{named(path)}: expected a folder of ROS 2 with metadata.yaml, or with one file *.mcap or *.db3, got {len(inside)} of these; name a file"
+            )
         return inside[0]
     with path.open("rb") as file:
         head = file.read(16)

@@ -15,7 +15,7 @@ relative motions (`EDGE2 from to dx dy dtheta ...`, or EDGE_SE2).
 What the poses of a log mean does not stand in it. The reader therefore goes through the log twice: the first time it surveys which poses
 are the odometer's, how the laser is mounted, and which range says that nothing was near; the second time it yields the scans.
 
-- If all poses of the scans are also those of the vertices, they are corrected ones, and odometry is the chain of the edges from each vertex to the next.
+- If the poses of the scans are those of vertices, they are corrected ones, and odometry is the chain of the edges from each vertex to the next.
 - If the first ODOM line after each scan repeats the scan's pose, whatever the ODOM line before the scan said, then the poses of the scans
   are corrected ones: GMapping writes logs in this way, with a NEFF line after each scan. Its ODOM lines are the odometer's increments, put behind
   each other from the corrected pose of the last scan on. Odometry is then the chain of these increments, from the line that repeats the pose of one scan to
@@ -23,12 +23,14 @@ are the odometer's, how the laser is mounted, and which range says that nothing 
   correction, and is no part of the chain.
 - If the first pose of the scans wanders from the second, it is a corrected one, and the second the odometer's.
 - Else the second pose is the odometer's, and the first is that of the laser, or the same.
+
+Where there are TRUEPOS lines, which CARMEN's simulator writes, they say where the robot truly was.
 """
 
 from __future__ import annotations
 
 import math
-import re
+from array import array
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -39,75 +41,71 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
-from perception.readers.lines import LONGEST_LINE, lines
+from perception.readers.graphs import ROUNDED, Graph
+from perception.readers.lines import lines
+from perception.readers.messages import (
+    EDGES,
+    KINDS,
+    NAME,
+    VERTICES,
+    Damaged,
+    ScanLine,
+    edge_of,
+    parameters_of,
+    pose_at,
+    scan_line,
+    time_at,
+    vertex_of,
+    words,
+)
 from perception.readers.scans import Damage, Laser, Reading, Scan
-from ssh_abduction.errors import brief
 from ssh_abduction.files import LINE_OF_A_LOG
 from ssh_abduction.odometry import Pose, between, moved
 
-# Kinds of scans, the best first, as many logs hold each scan more than once: those that say how the laser is made and where it was, then those that lack one of these.
-KINDS = ("ROBOTLASER1", "FLASER", "RAWLASER1")
-VERTICES, EDGES = (b"VERTEX2", b"VERTEX_SE2"), (b"EDGE2", b"EDGE_SE2")
-# What the poses of the scans are, in the order in which the head of this module names it; `lines` where scans have none.
+# What the poses of the scans are, in the order in which the head of this module names it; `lines` where scans have none, but ODOM lines are between them.
 Meaning: TypeAlias = Literal["edges", "restarts", "first corrected", "raw", "lines"]
-# So many scans wait for the next ODOM line, and a vertex is searched so many vertices behind another.
-MOST_WAITING = 100
-# Of the scans, such a share has to be as a rule says: of some scans lines are damaged.
+# Of the scans, such a share has to be as a rule says: the lines of some may be damaged.
 MOST_SCANS = 0.9
-# A scan has at most so many beams.
-MOST_BEAMS = 100_000
-# Poses beyond this, in metres, are no poses of a robot in a building.
-FARTHEST = 1e6
-# Two poses are the same up to such a difference in metres and radians: numbers in a log are rounded.
-ROUNDED = 2e-3
-# Where the laser's pose wanders farther than this from the odometer's, in metres and radians, it has been corrected; wandering less, it may have been read some milliseconds later.
+# Where the first pose is this far from the second, in metres and radians, it has been corrected; if it is less far, it may have been read some milliseconds later.
 WANDERED = (0.5, 0.25)
-# The ranges of a SICK LMS, in centimetres, above this one are codes: "nothing came back", "dazzled", and the like (SICK, Telegrams for LMS 200, 8183 to 8191).
+# The laser is mounted where its pose says, if that is the same in all scans up to such a difference, as some logs have two digits after the point.
+MOUNTED = 0.02
+# Poses of vertices that nowhere differ more than so many metres from the chain of the edges have not been corrected.
+CORRECTED = 0.05
+# The ranges of a SICK LMS, in metres, from this one on are codes: "nothing came back", "dazzled", and the like (SICK, Telegrams for LMS 200, values 8183 to 8191).
 SICK_REACH, SICK_MOST = 81.83, 81.91
 # Ranges in metres beyond this one are no measurement of any laser.
 NO_RANGE = 1000.0
-_WORD = re.compile(rb"[A-Za-z][A-Za-z0-9_]*$")
-_PARAMETERS = {
-    b"robot_frontlaser_offset": "offset",
-    b"robot_frontlaser_side_offset": "side",
-    b"robot_frontlaser_angular_offset": "angle",
-    b"robot_front_laser_max": "reach",
-    b"laser_front_laser_fov": "fov",
-}
-
-
-class _Damaged(Exception):  # noqa: N818 - becomes a Damage
-    """A line of a known kind that cannot be read."""
-
-
-@dataclass(frozen=True, slots=True)
-class _ScanLine:
-    """A line that holds a scan. `first` and `second` are its poses, the laser's or a corrected one and the robot's, if it has any."""
-
-    kind: str
-    ranges: NDArray[np.float64]
-    shape: tuple[float, float, float] | None
-    first: Pose | None
-    second: Pose | None
-    time: float | None
+# Lines of CARMEN that say nothing here.
+OTHERS = (b"SYNC", b"RLASER", b"ROBOTLASER2", b"RAWLASER2", *(kind.encode() for kind in KINDS))
+# So many scans wait at most for the next ODOM line.
+MOST_WAITING = 100
 
 
 @dataclass(slots=True)
 class _Survey:
-    """What the first way through a log finds of one kind of scans."""
+    """What the first way through a log finds of one kind of scans.
+
+    most, repeated  the largest range, and how often it came
+    mount           the first pose in the frame of the second, at the first scan; it is about the same in so many scans (`mounted`), and far off in others (`wandered`)
+    same            scans whose two poses are the same
+    restarts        scans whose pose the next ODOM line repeats, though the line before was for the same time and says otherwise
+    moves           scans at which this could be seen
+    unmoved         lines of the scans since whose predecessor no ODOM line tells how the robot moved
+    poses           the second poses, three numbers each
+    """
 
     scans: int = 0
-    most: float = 0.0  # the largest range, and how often it came
+    most: float = 0.0
     repeated: int = 0
-    mount: Pose | None = None  # the first pose in the frame of the second, at the first scan; and of how many scans it is another
+    mount: Pose | None = None
+    mounted: int = 0
     wandered: int = 0
-    same: int = 0  # scans whose two poses are the same
-    restarts: int = (
-        0  # scans whose pose the next ODOM line repeats, though the one before said otherwise; and scans at which this could be seen
-    )
+    same: int = 0
+    restarts: int = 0
     moves: int = 0
-    unmoved: list[int] = field(default_factory=list)  # lines of scans since whose predecessor no ODOM line tells how the robot moved
-    at_vertices: int = 0  # scans whose second pose is that of the vertex before
+    unmoved: list[int] = field(default_factory=list)
+    poses: array[float] = field(default_factory=lambda: array("d"))
 
 
 @dataclass(slots=True)
@@ -117,8 +115,7 @@ class _Found:
     kinds: dict[str, _Survey] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
     tags: Counter[str] = field(default_factory=Counter)
-    vertices: list[tuple[int, Pose]] = field(default_factory=list)
-    edges: dict[tuple[int, int], Pose] = field(default_factory=dict)
+    graph: Graph = field(default_factory=Graph)
 
 
 def looks_like(head: bytes) -> bool:
@@ -134,48 +131,39 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
     Raises LogError where the log holds no scan, or no odometry.
     """
     found = _survey(file, source, format != "carmen")
-    if format == "g2o" and not found.vertices:
+    if format == "g2o" and not found.graph.vertices:
         raise LogError(f"{source}: expected vertices in lines VERTEX2 or VERTEX_SE2, got none; leave the format out, or name carmen")
     if not found.kinds:
-        others = ", ".join(f"{count} {tag}" for tag, count in found.tags.most_common(5)) or "none"
+        tags = ", ".join(f"{count} {tag}" for tag, count in found.tags.most_common(5)) or "none"
         raise LogError(
-            f"{source}: expected scans in lines FLASER, ROBOTLASER1 or RAWLASER1, got none (lines: {others}); record the laser, too"
+            f"{source}: expected scans in lines {', '.join(KINDS)}, got none that can be read (lines: {tags}); record the laser, too"
         )
     most = max(survey.scans for survey in found.kinds.values())
     kind = next(kind for kind in KINDS if kind in found.kinds and 2 * found.kinds[kind].scans >= most)
-    return _reading(file, source, found, kind)
-
-
-def _reading(file: IO[bytes], source: str, found: _Found, kind: str) -> Reading:
     survey, notes = found.kinds[kind], []
-    others = [other for other in (*found.kinds, "RLASER", "ROBOTLASER2") if other != kind and (other in found.kinds or found.tags[other])]
+    others = [other for other in (*KINDS, "RLASER", "ROBOTLASER2") if other != kind and (other in found.kinds or found.tags[other])]
     if others:
-        notes.append(f"The scans are those of the lines {kind}; those of {', '.join(dict.fromkeys(others))} are not read.")
+        notes.append(f"The scans are those of the lines {kind}; those of {', '.join(others)} are not read.")
     meaning = _meaning(found, survey, kind, source, notes)
+    is_corrected = meaning != "edges" or found.graph.is_corrected(CORRECTED)
+    if not is_corrected:
+        notes.append("The poses of the vertices have not been corrected: they are the chain of the edges.")
     mount = _mount(found, survey, meaning, kind)
     reach = _reach(found, survey, kind, notes)
-    return Reading("g2o" if found.vertices else "carmen", tuple(notes), _scans(file, source, found, kind, meaning, mount, reach))
+    items = _scans(file, source, _Odometer(found, meaning, is_corrected), kind, mount, reach)
+    return Reading("g2o" if found.graph.vertices else "carmen", tuple(notes), items)
 
 
 def _meaning(found: _Found, survey: _Survey, kind: str, source: str, notes: list[str]) -> Meaning:
-    """What the poses of the scans are. Raises LogError."""
-    if found.vertices:
-        if survey.at_vertices >= MOST_SCANS * survey.scans:
-            if not found.edges:
-                raise LogError(
-                    f"{source}: expected odometry, got corrected poses alone (VERTEX2, and the same in {kind}) and no EDGE2; take the log before it was corrected"
-                )
-            notes.append(
-                f"The robot's poses in {kind} are the corrected ones of VERTEX2. Odometry is the chain of the EDGE2 from each vertex to the next."
-            )
-            return "edges"
-        notes.append(f"The poses in {kind} differ from those of VERTEX2: the former are taken for odometry, the latter for corrected ones.")
-        return "raw"
+    """What the poses of the scans are. Raises LogError where none are the odometer's."""
+    is_same = survey.same >= MOST_SCANS * survey.scans
     if kind == "RAWLASER1":
         if not found.tags["ODOM"]:
             raise LogError(f"{source}: expected odometry, got neither ODOM lines nor poses in {kind}; record the odometer, too")
         return "lines"
-    if survey.same >= MOST_SCANS * survey.scans and (found.tags["NEFF"] or 2 * survey.restarts > survey.moves > 0):
+    if found.graph.vertices:
+        return _meaning_beside_graph(found.graph, survey, kind, source, notes)
+    if is_same and (found.tags["NEFF"] or 2 * survey.restarts > survey.moves > 0):
         if not found.tags["ODOM"]:
             raise LogError(
                 f"{source}: expected odometry, got corrected poses alone (NEFF lines, but no ODOM); take the log before it was corrected"
@@ -185,9 +173,8 @@ def _meaning(found: _Found, survey: _Survey, kind: str, source: str, notes: list
             "chain of the increments of the ODOM lines between two scans, without the jumps of the correction. It is no recorded odometry."
         )
         if survey.unmoved:
-            where = ", ".join(map(str, survey.unmoved[:5])) + (", …" if len(survey.unmoved) > 5 else "")
             notes.append(
-                f"No ODOM line tells how the robot moved before the scans in these {len(survey.unmoved)} lines, so that it seems to have stood still: {where}."
+                f"No ODOM line tells how the robot moved before the scans in these lines, so that it seems to have stood still: {_listed(survey.unmoved)}."
             )
         return "restarts"
     if survey.wandered > (1 - MOST_SCANS) * survey.scans:
@@ -196,20 +183,41 @@ def _meaning(found: _Found, survey: _Survey, kind: str, source: str, notes: list
     return "raw"
 
 
+def _meaning_beside_graph(graph: Graph, survey: _Survey, kind: str, source: str, notes: list[str]) -> Meaning:
+    """What the poses of the scans are where there are vertices. Raises LogError."""
+    if graph.share_at_vertices(survey.poses) < MOST_SCANS:
+        notes.append(f"The poses in {kind} differ from those of VERTEX2: the former are taken for odometry, the latter for corrected ones.")
+        return "raw"
+    if not graph.edges:
+        raise LogError(
+            f"{source}: expected odometry, got corrected poses alone (VERTEX2, and the same in {kind}) and no EDGE2; take the log before it was corrected"
+        )
+    notes.append(
+        f"The robot's poses in {kind} are those of VERTEX2, and so corrected ones. Odometry is the chain of the EDGE2 from each vertex to the next."
+    )
+    if gaps := graph.chain.gaps:
+        notes.append(f"No EDGE2 tells how the robot moved before these vertices, so that it seems to have stood still: {_listed(gaps)}.")
+    return "edges"
+
+
+def _listed(numbers: list[int] | tuple[int, ...]) -> str:
+    return ", ".join(map(str, numbers[:5])) + (f" and {len(numbers) - 5} more" if len(numbers) > 5 else "")
+
+
 def _mount(found: _Found, survey: _Survey, meaning: Meaning, kind: str) -> Pose:
     """The pose of the laser in the frame of the robot: what its poses say, else what the parameters say."""
     own = survey.mount
-    if own is not None and meaning in ("raw", "edges") and max(map(abs, own)) > ROUNDED:
+    if own is not None and meaning in ("raw", "edges") and max(map(abs, own)) > ROUNDED and survey.mounted >= MOST_SCANS * survey.scans:
         x, y, angle = own
-        return round(x, 3), round(y, 3), round(angle, 4)
-    if kind == "ROBOTLASER1" and meaning != "first corrected":
+        return round(x, 4), round(y, 4), round(angle, 5)
+    if kind == "ROBOTLASER1" and meaning in ("raw", "edges"):
         return (0.0, 0.0, 0.0)
     parameters = found.parameters
     return parameters.get("offset", 0.0), parameters.get("side", 0.0), parameters.get("angle", 0.0)
 
 
 def _reach(found: _Found, survey: _Survey, kind: str, notes: list[str]) -> float:
-    """The range that says that nothing was near, where lines do not say it themselves."""
+    """The range that says that nothing was near; infinite where the lines of the scans say it themselves."""
     if kind != "FLASER":
         return math.inf
     if (reach := found.parameters.get("reach", 0.0)) > 0:
@@ -224,47 +232,55 @@ def _reach(found: _Found, survey: _Survey, kind: str, notes: list[str]) -> float
 
 def _survey(file: IO[bytes], source: str, with_graph: bool) -> _Found:
     found = _Found()
-    odometer: Pose | None = None
+    odometer: tuple[Pose, float | None] | None = None  # pose and time of the last ODOM line
     since: dict[str, int] = {}  # ODOM lines since the last scan of a kind
-    waiting: tuple[_Survey, Pose, Pose] | None = None  # a scan's survey, its pose, and the odometer's before it: until the next ODOM line
+    waiting: tuple[_Survey, ScanLine, tuple[Pose, float | None] | None] | None = (
+        None  # a scan, and the ODOM line before it, until the next one
+    )
     for number, raw in lines(file, source):
         tokens = raw.split() if raw is not None else []
-        if not tokens or not _WORD.match(tokens[0]):
+        if not tokens or not NAME.match(tokens[0]):
             continue
         tag = tokens[0]
-        if len(found.tags) < 100:
-            found.tags[tag[:20].decode("ascii")] += 1
         try:
             if tag == b"ODOM":
-                pose = _pose(tokens, 1)
+                pose, time = pose_at(tokens, 1), time_at(tokens, 7)
                 since = {kind: count + 1 for kind, count in since.items()}
                 if waiting is not None:
-                    survey, at, before = waiting
-                    if before != at:
-                        survey.moves += 1
-                        survey.restarts += pose == at
+                    _count_restart(*waiting, pose, time)
                     waiting = None
-                odometer = pose
+                odometer = pose, time
             elif tag == b"PARAM":
-                found.parameters.update(_parameter(tokens))
+                found.parameters.update(parameters_of(tokens))
             elif tag in VERTICES and with_graph:
-                found.vertices.append(_vertex(tokens))
+                found.graph.vertices.append(vertex_of(tokens))
             elif tag in EDGES and with_graph:
-                ends, motion = _edge(tokens)
-                found.edges.setdefault(ends, motion)
-            elif (line := _scan_line(tokens)) is not None:
+                ends, motion = edge_of(tokens)
+                found.graph.edges.setdefault(ends, motion)
+            elif (line := scan_line(tokens)) is not None:
                 survey = found.kinds.setdefault(line.kind, _Survey())
-                _count(survey, line, found.vertices[-1][1] if found.vertices else None)
+                _count(survey, line)
                 if since.get(line.kind, 2) < 2:  # the first only repeats the pose of the scan before
                     survey.unmoved.append(number)
                 since[line.kind] = 0
-                waiting = (survey, line.second, odometer) if line.second is not None and odometer is not None else None
-        except _Damaged:
+                waiting = survey, line, odometer
+        except Damaged:
             continue
+        if len(found.tags) < 100 or tag.decode("ascii") in found.tags:
+            found.tags[tag[:20].decode("ascii")] += 1
     return found
 
 
-def _count(survey: _Survey, line: _ScanLine, vertex: Pose | None) -> None:
+def _count_restart(survey: _Survey, line: ScanLine, before: tuple[Pose, float | None] | None, pose: Pose, time: float | None) -> None:
+    """Take in an ODOM line that follows a scan."""
+    if line.second is None or before is None or before[0] == line.second:
+        return
+    survey.moves += 1
+    # The robot cannot have moved between two lines of one time.
+    survey.restarts += pose == line.second and (before[1] == line.time or time != line.time)
+
+
+def _count(survey: _Survey, line: ScanLine) -> None:
     survey.scans += 1
     ranges = line.ranges[line.ranges <= NO_RANGE]
     most = float(ranges.max(initial=0.0))
@@ -274,42 +290,37 @@ def _count(survey: _Survey, line: _ScanLine, vertex: Pose | None) -> None:
         survey.repeated += int(np.count_nonzero(ranges == most))
     if line.first is None or line.second is None:
         return
+    survey.poses.extend(line.second)
     survey.same += line.first == line.second
-    survey.at_vertices += vertex is not None and _are_same(vertex, line.second)
     mount = between(line.second, line.first)
-    if survey.mount is None:
-        survey.mount = mount
+    survey.mount = survey.mount or mount
     x, y, angle = between(survey.mount, mount)
+    survey.mounted += max(abs(x), abs(y), abs(angle)) <= MOUNTED
     survey.wandered += math.hypot(x, y) > WANDERED[0] or abs(angle) > WANDERED[1]
 
 
-def _are_same(a: Pose, b: Pose) -> bool:
-    return all(abs(v) <= ROUNDED for v in between(a, b))
-
-
-def _scans(file: IO[bytes], source: str, found: _Found, kind: str, meaning: Meaning, mount: Pose, reach: float) -> Iterator[Scan | Damage]:
+def _scans(file: IO[bytes], source: str, odometer: _Odometer, kind: str, mount: Pose, reach: float) -> Iterator[Scan | Damage]:
     """The scans, and what was skipped."""
-    odometer = _Odometer(found, meaning)
-    waiting: list[Scan | Damage] = []  # scans without a pose, whose place is known with the next ODOM line
-    fov = found.parameters.get("fov")
+    waiting: list[Scan | Damage] = []  # what waits for the next ODOM line, where the scans have no poses
+    fov = odometer.found.parameters.get("fov")
     for number, raw in lines(file, source):
         tag = b""
         try:
-            tokens = _tokens(raw)
+            tokens = words(raw)
             if not tokens:
                 continue
             tag = tokens[0]
             if tag != kind.encode():
                 odometer.hear(tag, tokens)
-            elif (line := _scan_line(tokens)) is not None:
-                scan = Scan(*_measured(line, mount, reach, fov), *odometer.place(line), line.time, number)
-                waiting.append(scan)
-        except _Damaged as damage:
+            elif (line := scan_line(tokens)) is not None:
+                waiting.append(Scan(*_measured(line, mount, reach, fov), *odometer.place(line), line.time, number))
+        except Damaged as damage:
             odometer.mishear(tag)
             waiting.append(Damage(number, str(damage)))
-        if meaning != "lines" or tag == b"ODOM" or len(waiting) >= MOST_WAITING:
+        if odometer.meaning != "lines" or tag == b"ODOM" or len(waiting) >= MOST_WAITING:
             yield from map(odometer.placed, waiting)
             waiting.clear()
+    odometer.before = odometer.last
     yield from map(odometer.placed, waiting)
 
 
@@ -317,65 +328,69 @@ def _scans(file: IO[bytes], source: str, found: _Found, kind: str, meaning: Mean
 class _Odometer:
     """Where the odometer puts the scans, by the lines of a log so far.
 
-    chain     odometry, where it is pieced together
-    last      pose and time of the last ODOM line; and of the one before
-    restarts  whether the next ODOM line starts from a corrected pose, and tells of no motion
-    truth     of the last TRUEPOS line: the true pose, and the odometer's
+    chain         odometry, where it is pieced together of ODOM lines
+    behind        the same before the last ODOM line since the last scan
+    last, before  pose and time of the last ODOM line, and of the one before
+    restarts      whether the next ODOM line starts from a corrected pose, and tells of no motion
+    vertex        index of the last vertex
+    truth         a corrected pose, and the odometer's at the same time
+    news          a corrected pose, until the next scan says where the odometer is
     """
 
     found: _Found
     meaning: Meaning
+    is_corrected: bool
     chain: Pose = (0.0, 0.0, 0.0)
+    behind: Pose = (0.0, 0.0, 0.0)
     last: tuple[Pose, float | None] | None = None
     before: tuple[Pose, float | None] | None = None
     restarts: bool = False
-    vertex: tuple[int, Pose] | None = None
+    vertex: int | None = None
     truth: tuple[Pose, Pose] | None = None
+    news: Pose | None = None
 
     def hear(self, tag: bytes, tokens: list[bytes]) -> None:
-        """Take in a line that is no scan's. Raises _Damaged."""
+        """Take in a line that is no scan's. Raises Damaged."""
         if tag == b"ODOM":
-            pose = _pose(tokens, 1)
+            pose = pose_at(tokens, 1)
+            self.behind = self.chain
             if self.last is not None and not self.restarts:
                 self.chain = moved(self.chain, between(self.last[0], pose))
-            self.before, self.last, self.restarts = self.last, (pose, _time(tokens, 7)), False
+            self.before, self.last, self.restarts = self.last, (pose, time_at(tokens, 7)), False
+        elif tag == b"NEFF":
+            self.chain = self.behind  # the ODOM line before repeated the pose of a scan, even if the line of that scan is missing
         elif tag == b"TRUEPOS":
-            self.truth = _pose(tokens, 1), _pose(tokens, 4)
+            self.truth = pose_at(tokens, 1), pose_at(tokens, 4)
         elif tag == b"PARAM":
-            _parameter(tokens)  # which the survey took, as it took the edges, without a word of what is damaged
-        elif self.found.vertices and tag in EDGES:
-            _edge(tokens)
-        elif self.found.vertices and tag in VERTICES:
-            vertex = _vertex(tokens)
-            if self.vertex is not None and self.meaning == "edges":
-                self.chain = moved(self.chain, _motion(self.found.edges, self.vertex[0], vertex[0]))
-            self.vertex = vertex
+            parameters_of(tokens)  # which the survey took, as it took the edges, without a word of what is damaged
+        elif self.found.graph.vertices and tag in EDGES:
+            edge_of(tokens)
+        elif self.found.graph.vertices and tag in VERTICES:
+            self.news = vertex_of(tokens)[1]
+            self.vertex = 0 if self.vertex is None else self.vertex + 1
+        elif tag not in OTHERS:
+            self.mishear(tag)
 
     def mishear(self, tag: bytes) -> None:
-        """Take in that a line is damaged. It may have been a scan's, after which ODOM lines start anew; then the next one is not taken for a motion."""
+        """Take in that a line cannot be read. It may have been a scan's, after which ODOM lines start anew; then the next one is not taken for a motion."""
         self.restarts |= self.meaning == "restarts" and tag != b"ODOM"
 
-    def place(self, line: _ScanLine) -> tuple[Pose, Pose | None]:
-        """The pose of a scan by the odometer, and its corrected one, where it is known. Raises _Damaged."""
+    def place(self, line: ScanLine) -> tuple[Pose, Pose | None]:
+        """The pose of a scan by the odometer, and its corrected one, where it is known. Raises Damaged."""
         first, second = line.first, line.second
-        corrected: Pose | None = None
         if first is None or second is None:
-            odometry = self.chain  # until it is placed
-        elif self.meaning == "edges":
-            if self.vertex is None or not _are_same(self.vertex[1], second):
-                raise _Damaged("expected the pose of the vertex before, got another; the line of its own vertex is missing")
+            return self.chain, None  # until it is placed
+        if self.meaning == "edges":
+            index = self.found.graph.index_at(second, self.vertex)
+            if index is None:
+                raise Damaged(f"expected the pose of a vertex in {line.kind}, got another; the line of its vertex is missing or damaged")
+            return self.found.graph.chain.poses[index], second if self.is_corrected else None
+        if self.meaning == "restarts":
+            self.last, self.restarts, self.behind = (second, line.time), True, self.chain
             return self.chain, second
-        elif self.meaning == "restarts":
-            odometry, corrected = self.chain, second
-            self.last, self.restarts = (second, line.time), True
-        else:
-            odometry = second
-            corrected = first if self.meaning == "first corrected" else None
-        if self.truth is not None:
-            corrected = moved(self.truth[0], between(self.truth[1], odometry))
-        elif self.vertex is not None:
-            corrected = self.vertex[1]
-        return odometry, corrected
+        if self.news is not None:
+            self.truth, self.news = (self.news, second), None
+        return second, self._truly(second) or (first if self.meaning == "first corrected" else None)
 
     def placed(self, item: Scan | Damage) -> Scan | Damage:
         """A scan that has no pose of its own, where the odometer was at its time between the last two ODOM lines; all else unchanged."""
@@ -387,39 +402,15 @@ class _Odometer:
         else:
             share = (item.time - began) / (ended - began)
         dx, dy, turned = between(start, end)
-        return replace(item, odometry=moved(start, (share * dx, share * dy, share * turned)))
+        odometry = moved(start, (share * dx, share * dy, share * turned))
+        return replace(item, odometry=odometry, corrected=self._truly(odometry))
+
+    def _truly(self, odometry: Pose) -> Pose | None:
+        """Where the robot was, by the last corrected pose and what the odometer says since."""
+        return moved(self.truth[0], between(self.truth[1], odometry)) if self.truth is not None else None
 
 
-def _tokens(raw: bytes | None) -> list[bytes]:
-    """The words of a line; none where it is empty or a comment. Raises _Damaged for what is no message."""
-    if raw is None:
-        raise _Damaged(f"expected a line of at most {LONGEST_LINE // 2**20} MiB, got a longer one")
-    tokens = raw.split()
-    if not tokens or tokens[0].startswith(b"#"):
-        return []
-    if not _WORD.match(tokens[0]):
-        raise _Damaged(f"expected the name of a message, got {_quoted(tokens[0])}")
-    return tokens
-
-
-def _motion(edges: dict[tuple[int, int], Pose], start: int, end: int) -> Pose:
-    """The relative motion from one vertex to another, over those between where there is no edge. Raises _Damaged where no edges say it."""
-    if (motion := edges.get((start, end))) is not None:
-        return motion
-    if (back := edges.get((end, start))) is not None:
-        return between(back, (0.0, 0.0, 0.0))
-    motion = (0.0, 0.0, 0.0)
-    for vertex in range(start, min(end, start + MOST_WAITING)):
-        if (step := edges.get((vertex, vertex + 1))) is None:
-            break
-        motion = moved(motion, step)
-    else:
-        if start < end <= start + MOST_WAITING:
-            return motion
-    raise _Damaged(f"expected an EDGE2 from vertex {start} to {end}, got none; the robot seems to have stood still")
-
-
-def _measured(line: _ScanLine, mount: Pose, reach: float, fov: float | None) -> tuple[NDArray[np.float64], Laser]:
+def _measured(line: ScanLine, mount: Pose, reach: float, fov: float | None) -> tuple[NDArray[np.float64], Laser]:
     beams = len(line.ranges)
     if line.shape is None:
         laser = _conventional(beams, math.pi if fov is None or not 0 < fov <= math.tau else fov, reach, mount)
@@ -442,105 +433,3 @@ def _conventional(beams: int, fov: float, reach: float, mount: Pose) -> Laser:
 @lru_cache(maxsize=64)
 def _described(first: float, step: float, reach: float, beams: int, mount: Pose) -> Laser:
     return Laser(first, step, beams, reach, mount)
-
-
-def _scan_line(tokens: list[bytes]) -> _ScanLine | None:
-    """The scan that a line holds; None where the line is of another kind. Raises _Damaged."""
-    kind = tokens[0].decode("ascii")
-    if kind not in KINDS:
-        return None
-    if kind == "FLASER":
-        beams, after = _ranges(tokens, 1)
-        poses = after
-        end = after + 6
-        shape = None
-    else:
-        if len(tokens) < 9:
-            raise _Damaged(f"expected at least 8 values after {kind}, got {len(tokens) - 1}")
-        start, step, reach = _number(tokens[2]), _number(tokens[4]), _number(tokens[5])
-        if not 0 < abs(step) <= math.tau or abs(start) > 2 * math.tau:
-            raise _Damaged(f"expected a start and a step in radians, got {start:g} and {step:g}")
-        shape = start, step, reach if reach > 0 else math.inf
-        beams, after = _ranges(tokens, 8)
-        poses = after + 1 + _whole(tokens[after] if after < len(tokens) else b"", "remissions")
-        end = poses if kind == "RAWLASER1" else poses + 11
-    if not end <= len(tokens) <= end + 3:
-        raise _Damaged(f"expected {end} to {end + 3} words in a {kind} of {len(beams)} beams, got {len(tokens)}")
-    first, second = (None, None) if kind == "RAWLASER1" else (_pose(tokens, poses), _pose(tokens, poses + 3))
-    return _ScanLine(kind, beams, shape, first, second, _time(tokens, end))
-
-
-def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
-    """The ranges whose number stands at a position, and the position after them."""
-    count = _whole(tokens[at] if at < len(tokens) else b"", "beams")
-    if count == 0:
-        raise _Damaged("expected at least one beam, got none")
-    start = at + 1
-    words = tokens[start : start + count]
-    if len(words) < count:
-        raise _Damaged(f"expected {count} ranges, got {len(words)}")
-    try:
-        return np.array(list(map(float, words))), start + count
-    except ValueError:
-        wrong = next(word for word in words if not _is_number(word))
-        raise _Damaged(f"expected a range, got {_quoted(wrong)}") from None
-
-
-def _pose(tokens: list[bytes], at: int) -> Pose:
-    if len(tokens) < at + 3:
-        raise _Damaged(f"expected a pose of three numbers after word {at}, got {max(0, len(tokens) - at)}")
-    x, y, heading = map(_number, tokens[at : at + 3])
-    if max(abs(x), abs(y)) > FARTHEST or abs(heading) > FARTHEST:
-        raise _Damaged(f"expected a pose in metres and radians, got {x:g} {y:g} {heading:g}")
-    return x, y, heading
-
-
-def _vertex(tokens: list[bytes]) -> tuple[int, Pose]:
-    return _whole(tokens[1] if len(tokens) > 1 else b"", "vertex"), _pose(tokens, 2)
-
-
-def _edge(tokens: list[bytes]) -> tuple[tuple[int, int], Pose]:
-    if len(tokens) < 3:
-        raise _Damaged("expected an edge between two vertices, got fewer words")
-    return (_whole(tokens[1], "vertex"), _whole(tokens[2], "vertex")), _pose(tokens, 3)
-
-
-def _parameter(tokens: list[bytes]) -> dict[str, float]:
-    """What a PARAM line says, if it says something of the laser."""
-    if len(tokens) < 2 or tokens[1] not in _PARAMETERS:
-        return {}
-    return {_PARAMETERS[tokens[1]]: _number(tokens[2] if len(tokens) > 2 else b"")}
-
-
-def _time(tokens: list[bytes], at: int) -> float | None:
-    """The time at a position, if there is one: nothing depends on it, so a time that cannot be read is none."""
-    if at >= len(tokens) or not _is_number(tokens[at]):
-        return None
-    time = float(tokens[at])
-    return time if math.isfinite(time) else None
-
-
-def _number(word: bytes) -> float:
-    """A finite number. Raises _Damaged."""
-    if not _is_number(word) or not math.isfinite(value := float(word)):
-        raise _Damaged(f"expected a finite number, got {_quoted(word)}")
-    return value
-
-
-def _whole(word: bytes, what: str) -> int:
-    """A whole number that is not negative. Raises _Damaged."""
-    if not (word.isdigit() and len(word) < 10) or (value := int(word)) > MOST_BEAMS * 1000:
-        raise _Damaged(f"expected a number ({what}), got {_quoted(word)}")
-    return value
-
-
-def _is_number(word: bytes) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _quoted(word: bytes) -> str:
-    return brief(word[:40].decode("utf-8", "replace"), 40)

@@ -1,0 +1,106 @@
+"""A graph of poses, as g2o and TORO keep it: vertices with corrected poses, and edges with the relative motions from which these were computed.
+
+>>> from perception.readers.graphs import Graph
+>>> graph = Graph()
+>>> graph.vertices += [(0, (0.0, 0.0, 0.0)), (1, (1.1, 0.0, 0.0)), (2, (2.2, 0.0, 0.0))]
+>>> graph.edges |= {(0, 1): (1.0, 0.0, 0.0), (1, 2): (1.0, 0.0, 0.0), (0, 2): (2.2, 0.0, 0.0)}
+>>> graph.chain.poses
+((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 0.0, 0.0))
+>>> graph.index_at((2.2, 0.0, 0.0))
+2
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.odometry import Pose, between, moved
+
+# Two poses are the same up to such a difference in metres and radians: numbers in a log are rounded.
+ROUNDED = 2e-3
+# From a vertex to the next in the file there may be no edge, as the line of one between them is damaged: so many may be between them.
+MOST_BETWEEN = 100
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Odometry at each vertex, in the order of the file: the edges from each vertex to the next, one behind the other.
+
+    gaps  the vertices before which no edge tells how the robot moved, so that it seems to have stood still
+    """
+
+    poses: tuple[Pose, ...]
+    gaps: tuple[int, ...]
+
+
+@dataclass
+class Graph:
+    """Vertices, each a number and a pose, in the order of the file, and edges, by the numbers of their ends. Complete once it is asked for anything else."""
+
+    vertices: list[tuple[int, Pose]] = field(default_factory=list)
+    edges: dict[tuple[int, int], Pose] = field(default_factory=dict)
+
+    @cached_property
+    def chain(self) -> Chain:
+        poses: list[Pose] = [(0.0, 0.0, 0.0)]
+        gaps: list[int] = []
+        for (start, _), (end, _) in zip(self.vertices, self.vertices[1:], strict=False):
+            motion = self._motion(start, end)
+            if motion is None:
+                gaps.append(end)
+            poses.append(moved(poses[-1], motion or (0.0, 0.0, 0.0)))
+        return Chain(tuple(poses), tuple(gaps))
+
+    def _motion(self, start: int, end: int) -> Pose | None:
+        """The motion from one vertex to another, over those between where there is no edge."""
+        if (motion := self.edges.get((start, end))) is not None:
+            return motion
+        if (back := self.edges.get((end, start))) is not None:
+            return between(back, (0.0, 0.0, 0.0))
+        if not start < end <= start + MOST_BETWEEN:
+            return None
+        motion = (0.0, 0.0, 0.0)
+        for vertex in range(start, end):
+            if (step := self.edges.get((vertex, vertex + 1))) is None:
+                return None
+            motion = moved(motion, step)
+        return motion
+
+    def is_corrected(self, farthest: float) -> bool:
+        """Whether the poses of the vertices are others than odometry, somewhere by more than so many metres."""
+        first = self.vertices[0][1]
+        return any(
+            math.dist(between(first, pose)[:2], odometry[:2]) > farthest
+            for (_, pose), odometry in zip(self.vertices, self.chain.poses, strict=True)
+        )
+
+    def index_at(self, pose: Pose, guess: int | None = None) -> int | None:
+        """The index of the vertex that has a pose, first the one that is guessed; None where none has it."""
+        if guess is not None and same_pose(self.vertices[guess][1], pose):
+            return guess
+        near: list[int] = self._tree.query_ball_point(pose[:2], 2 * ROUNDED)
+        return next((i for i in sorted(near) if same_pose(self.vertices[i][1], pose)), None)
+
+    def share_at_vertices(self, poses: Sequence[float]) -> float:
+        """Of some poses, whose numbers follow each other, the share that vertices have."""
+        table: NDArray[np.float64] = np.reshape(poses, (-1, 3))
+        last = len(self.vertices) - 1
+        at = sum(self.index_at((x, y, heading), min(i, last)) is not None for i, (x, y, heading) in enumerate(table.tolist()))
+        return at / max(1, len(table))
+
+    @cached_property
+    def _tree(self) -> Any:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(np.array([pose[:2] for _, pose in self.vertices]))
+
+
+def same_pose(a: Pose, b: Pose) -> bool:
+    return all(abs(v) <= ROUNDED for v in between(a, b))

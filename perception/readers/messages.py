@@ -1,0 +1,161 @@
+"""What the lines of CARMEN's, g2o's and TORO's logs say, a line at a time. What a line means for others is no matter of this module."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.readers.lines import LONGEST_LINE
+from ssh_abduction.errors import brief
+from ssh_abduction.odometry import Pose
+
+# Kinds of scans, the best first, as many logs hold each scan more than once: those that say how the laser is made and where it was, then those that lack one of these.
+KINDS = ("ROBOTLASER1", "FLASER", "RAWLASER1")
+# The lines of a graph of poses.
+VERTICES, EDGES = (b"VERTEX2", b"VERTEX_SE2"), (b"EDGE2", b"EDGE_SE2")
+# A scan has at most so many beams.
+MOST_BEAMS = 100_000
+# Poses beyond this, in metres, are no poses of a robot in a building.
+FARTHEST = 1e6
+NAME = re.compile(rb"[A-Za-z][A-Za-z0-9_]*$")
+_PARAMETERS = {
+    b"robot_frontlaser_offset": "offset",
+    b"robot_frontlaser_side_offset": "side",
+    b"robot_frontlaser_angular_offset": "angle",
+    b"robot_front_laser_max": "reach",
+    b"laser_front_laser_fov": "fov",
+}
+
+
+class Damaged(Exception):  # noqa: N818 - becomes a Damage
+    """A line of a known kind that cannot be read."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanLine:
+    """A line that holds a scan. `first` and `second` are its poses, the laser's or a corrected one and the robot's, if it has any."""
+
+    kind: str
+    ranges: NDArray[np.float64]
+    shape: tuple[float, float, float] | None
+    first: Pose | None
+    second: Pose | None
+    time: float | None
+
+
+def words(raw: bytes | None) -> list[bytes]:
+    """The words of a line; none where it is empty or a comment. Raises Damaged for what is no message."""
+    if raw is None:
+        raise Damaged(f"expected a line of at most {LONGEST_LINE // 2**20} MiB, got a longer one")
+    tokens = raw.split()
+    if not tokens or tokens[0].startswith(b"#"):
+        return []
+    if not NAME.match(tokens[0]):
+        raise Damaged(f"expected the name of a message, got {_quoted(tokens[0])}")
+    return tokens
+
+
+def scan_line(tokens: list[bytes]) -> ScanLine | None:
+    """The scan that a line holds; None where the line is of another kind. Raises Damaged."""
+    kind = tokens[0].decode("ascii")
+    if kind not in KINDS:
+        return None
+    if kind == "FLASER":
+        beams, after = _ranges(tokens, 1)
+        poses = after
+        end = after + 6
+        shape = None
+    else:
+        if len(tokens) < 9:
+            raise Damaged(f"expected at least 8 values after {kind}, got {len(tokens) - 1}")
+        start, step, reach = number_of(tokens[2]), number_of(tokens[4]), number_of(tokens[5])
+        if not 0 < abs(step) <= math.tau or abs(start) > 2 * math.tau:
+            raise Damaged(f"expected a start and a step in radians, got {start:g} and {step:g}")
+        shape = start, step, reach if reach > 0 else math.inf
+        beams, after = _ranges(tokens, 8)
+        poses = after + 1 + _whole(tokens[after] if after < len(tokens) else b"", "remissions")
+        end = poses if kind == "RAWLASER1" else poses + 11
+    if not end <= len(tokens) <= end + 3:
+        raise Damaged(f"expected {end} to {end + 3} words in a {kind} of {len(beams)} beams, got {len(tokens)}")
+    first, second = (None, None) if kind == "RAWLASER1" else (pose_at(tokens, poses), pose_at(tokens, poses + 3))
+    return ScanLine(kind, beams, shape, first, second, time_at(tokens, end))
+
+
+def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
+    """The ranges whose number stands at a position, and the position after them."""
+    count = _whole(tokens[at] if at < len(tokens) else b"", "beams")
+    if count == 0:
+        raise Damaged("expected at least one beam, got none")
+    start = at + 1
+    words = tokens[start : start + count]
+    if len(words) < count:
+        raise Damaged(f"expected {count} ranges, got {len(words)}")
+    try:
+        return np.array(list(map(float, words))), start + count
+    except ValueError:
+        wrong = next(word for word in words if not _is_number(word))
+        raise Damaged(f"expected a range, got {_quoted(wrong)}") from None
+
+
+def pose_at(tokens: list[bytes], at: int) -> Pose:
+    if len(tokens) < at + 3:
+        raise Damaged(f"expected a pose of three numbers after word {at}, got {max(0, len(tokens) - at)}")
+    x, y, heading = map(number_of, tokens[at : at + 3])
+    if max(abs(x), abs(y)) > FARTHEST or abs(heading) > FARTHEST:
+        raise Damaged(f"expected a pose in metres and radians, got {x:g} {y:g} {heading:g}")
+    return x, y, heading
+
+
+def vertex_of(tokens: list[bytes]) -> tuple[int, Pose]:
+    return _whole(tokens[1] if len(tokens) > 1 else b"", "vertex"), pose_at(tokens, 2)
+
+
+def edge_of(tokens: list[bytes]) -> tuple[tuple[int, int], Pose]:
+    if len(tokens) < 3:
+        raise Damaged("expected an edge between two vertices, got fewer words")
+    return (_whole(tokens[1], "vertex"), _whole(tokens[2], "vertex")), pose_at(tokens, 3)
+
+
+def parameters_of(tokens: list[bytes]) -> dict[str, float]:
+    """What a PARAM line says, if it says something of the laser."""
+    if len(tokens) < 2 or tokens[1] not in _PARAMETERS:
+        return {}
+    return {_PARAMETERS[tokens[1]]: number_of(tokens[2] if len(tokens) > 2 else b"")}
+
+
+def time_at(tokens: list[bytes], at: int) -> float | None:
+    """The time at a position, if there is one: nothing depends on it, so a time that cannot be read is none."""
+    if at >= len(tokens) or not _is_number(tokens[at]):
+        return None
+    time = float(tokens[at])
+    return time if math.isfinite(time) else None
+
+
+def number_of(word: bytes) -> float:
+    """A finite number. Raises Damaged."""
+    if not _is_number(word) or not math.isfinite(value := float(word)):
+        raise Damaged(f"expected a finite number, got {_quoted(word)}")
+    return value
+
+
+def _whole(word: bytes, what: str) -> int:
+    """A whole number that is not negative. Raises Damaged."""
+    if not (word.isdigit() and len(word) < 10) or (value := int(word)) > MOST_BEAMS * 1000:
+        raise Damaged(f"expected a number ({what}), got {_quoted(word)}")
+    return value
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _quoted(word: bytes) -> str:
+    return brief(word[:40].decode("utf-8", "replace"), 40)
