@@ -23,7 +23,7 @@ from skeleton import poses_of
 
 from perception.readers.logs import read_log
 from ssh_abduction import Action, DState, SSHMap, Step, Trace
-from ssh_abduction.evaluation import Evaluation, Relations, VisitsEvaluation, evaluate, evaluate_visits
+from ssh_abduction.evaluation import Evaluation, Relations, VisitsEvaluation, evaluate, evaluate_visits, told_poses
 
 Array = NDArray[np.float64]
 # A robot visits a place when it comes so near to it, in metres. In ACES3, anything from 1.5 to 6 m makes the same 15 visits.
@@ -96,10 +96,10 @@ class Truth:
                 found[min(at, key=lambda i: abs(scans[i] - middle))] = number
         return found
 
-    def names(self, scans: Sequence[int]) -> list[str]:
-        """The true place at which each of these scans was taken: that of the visit; else a door; else one that is named after the room, with others near it."""
+    def names(self, scans: Sequence[int], poses: Array | None = None) -> list[str]:
+        """The true place at which each of these scans was taken, or which it shows at this pose: that of the visit; else a door; else one that is named after the room, with others near it."""
         named: list[str | None] = [next((v.place for v in self.visits if v.first <= scan <= v.last), None) for scan in scans]
-        at = self.poses[np.asarray(scans, dtype=int), :2]
+        at = (self.poses[np.asarray(scans, dtype=int)] if poses is None else poses)[:, :2]
         for i, (x, y) in enumerate(at):
             if named[i] is None and self.doors:
                 door = min(self.doors, key=lambda name: math.dist(self.doors[name], (x, y)))  # type: ignore[index]
@@ -127,17 +127,27 @@ def visits_of(places: Mapping[str, Sequence[float]], poses: Array, reach: float 
 
 @dataclass(frozen=True)
 class Events:
-    """The events of a mapper, in order. scans: where; places: at which of its places; None where it does not say."""
+    """The events of a mapper, in order.
+
+    scans   at which the robot passed
+    places  at which of the mapper's places; None where it does not say
+    poses   where that is in truth, (n, 3), as the mapper sees it from the robot at that scan; None: where the robot was
+    """
 
     scans: tuple[int, ...]
     places: tuple[Hashable, ...]
+    poses: Array | None = None
 
     @staticmethod
     def of(trace: Trace, ssh_map: SSHMap | None = None) -> Events:
         """The visits of a trace that was made of a log, and where a map has them."""
         starts = [t for t in range(len(trace)) if t == 0 or trace.actions[t - 1].kind != "turn"]
         places = [None if ssh_map is None else ssh_map.dstates[ssh_map.labels[t]].place for t in starts]
-        return Events(tuple(int(trace.steps[t].extra["scan"]) for t in starts), tuple(places))
+        told = told_poses(trace)
+        poses = [pose for t in starts if (pose := told[t]) is not None]
+        return Events(
+            tuple(int(trace.steps[t].extra["scan"]) for t in starts), tuple(places), np.array(poses) if len(poses) == len(starts) else None
+        )
 
 
 @dataclass(frozen=True)
@@ -187,16 +197,17 @@ def judged(events: Events, truth: Truth) -> Figures:
     """How right these events are."""
     hits = sum(visit is not None for visit in truth.matched(events.scans))
     noticed = sum(any(stay.first <= scan <= stay.last for scan in events.scans) for stay in truth.stays)
-    names = truth.names(events.scans)
+    names = truth.names(events.scans, events.poses)
+    poses = truth.poses[list(events.scans)] if events.poses is None else events.poses
     numbers = {place: i for i, place in enumerate(dict.fromkeys(events.places))}
     # A trace of places alone, and a map of it in which each place has one dstate. So accuracy is that of places.
     steps = [
         Step(
             "v",
-            truth={"dstate": name, "place": name, "pose": truth.poses[scan].tolist()},
+            truth={"dstate": name, "place": name, "pose": pose.tolist()},
             extra={"time": truth.times[scan] if truth.times else None},
         )
-        for name, scan in zip(names, events.scans, strict=True)
+        for name, pose, scan in zip(names, poses, events.scans, strict=True)
     ]
     trace = Trace((*(replace(step, action=Action.of("travel")) for step in steps[:-1]), steps[-1]))
     dstates = tuple(DState(i, "v", i, None, None) for i in range(len(numbers)))
@@ -214,21 +225,21 @@ def judged(events: Events, truth: Truth) -> Figures:
 
 def with_names(trace: Trace, truth: Truth) -> Trace:
     """The trace with the true place of each step as its truth; in ACES3 with its heading, path and direction, too, where the step has a pose."""
-    names = truth.names([int(step.extra["scan"]) for step in trace.steps])
+    told = told_poses(trace)
+    scans = [int(step.extra["scan"]) for step in trace.steps]
+    names = truth.names(scans, np.array([truth.poses[scan] if pose is None else pose for scan, pose in zip(scans, told, strict=True)]))
     known = {visit.place for visit in truth.visits}
     steps = []
-    for step, name in zip(trace.steps, names, strict=True):
-        told: dict[str, Any] = {"place": name}
-        pose = step.truth.get("pose") if isinstance(step.truth, Mapping) else None
+    for step, name, pose in zip(trace.steps, names, told, strict=True):
+        says: dict[str, Any] = {"place": name}
         if pose is not None:
-            told["pose"] = pose
             quarter = round(pose[2] / (math.pi / 2)) % 4
-            told["heading"] = "ENWS"[quarter]
+            says |= {"pose": list(pose), "heading": "ENWS"[quarter]}
             if truth.grid and name in known:
                 row = next(i for i, names in enumerate(ACES_NAMES) if name in names)
                 along = f"row {row}" if quarter % 2 == 0 else f"column {ACES_NAMES[row].index(name)}"
-                told |= {"path": along, "direction": 1 if quarter < 2 else -1}
-        steps.append(replace(step, truth=told))
+                says |= {"path": along, "direction": 1 if quarter < 2 else -1}
+        steps.append(replace(step, truth=says))
     return replace(trace, steps=tuple(steps))
 
 
@@ -243,8 +254,8 @@ def main() -> None:
     truth = truth_of(options.log, options.truth)
     events = Events.of(trace)
     matched = truth.matched(events.scans)
-    for scan, name, visit in zip(events.scans, truth.names(events.scans), matched, strict=True):
-        x, y, heading = truth.poses[scan]
+    poses = truth.poses[list(events.scans)] if events.poses is None else events.poses
+    for scan, (x, y, heading), name, visit in zip(events.scans, poses, truth.names(events.scans, poses), matched, strict=True):
         print(
             f"scan {scan:4}  ({x:6.1f}, {y:6.1f}, {math.degrees(heading):4.0f})  {name}{'' if visit is not None or not truth.visits else '  no visit'}"
         )

@@ -133,6 +133,11 @@ def test_relations_judge_where_poses_are_missing(tmp_path: Path, capsys: pytest.
     assert (found.judge, found.places.judged, found.places.returns, found.places.unknown) == ("relations", 9, 3, 1)  # 2.1 m are in doubt
     assert found.maps[0].places is not None
     assert (found.maps[0].places.joined, found.maps[0].places.right) == (4, 1)
+    # The robot saw the third place 30 m to its left: that is far from the first one.
+    aside = replace(
+        trace, steps=tuple(replace(step, extra={**step.extra, "seen": [0, 30 * (t == 2), 0]}) for t, step in enumerate(trace.steps))
+    )
+    assert evaluate_visits([], aside, relations=Relations.load(tmp_path / "relations")).places.returns == 1
     trace.save(tmp_path / "trace.jsonl")
     labelled([0, 1, 0, 0, 1], [0, 1]).save(tmp_path / "map.json")
     arguments = ["evaluate", str(tmp_path / "map.json"), str(tmp_path / "trace.jsonl"), "--relations", str(tmp_path / "relations")]
@@ -192,6 +197,10 @@ def test_poses_and_times_that_cannot_be_used() -> None:
     relations = Relations([Relation(1.0, 2.0, (1.0, 0.0, 0.0))])
     with pytest.raises(TraceError, match=r"^step 0: time: expected seconds, got 'noon'"):
         evaluate_visits([ssh_map], posed([None] * 2, ["travel"], ["noon", 1]), relations=relations)  # type: ignore[list-item]
+    seen = posed([None] * 2, ["travel"], [1, 2])
+    seen = replace(seen, steps=tuple(replace(step, extra={**step.extra, "seen": "there"}) for step in seen.steps))
+    with pytest.raises(TraceError, match=r"^step 0: seen: expected \[x, y, heading\] in metres and radians, got 'there'"):
+        evaluate_visits([ssh_map], seen, relations=relations)
     with pytest.raises(TraceError, match=r"^trace: time: expected steps at times that are related, from 1 to 2 s, got none"):
         evaluate_visits([ssh_map], posed([None] * 2, ["travel"], [7, 8]), relations=relations)
 

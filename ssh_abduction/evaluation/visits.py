@@ -29,7 +29,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.motion import Pose
+from simulator.motion import Pose, between, moved
 from ssh_abduction.errors import TraceError, brief, is_finite, named
 from ssh_abduction.evaluation.names import checked_map
 from ssh_abduction.evaluation.relations import Relations
@@ -174,16 +174,17 @@ def evaluate_visits(
 
 def told_poses(trace: Trace) -> list[Pose | None]:
     """The true pose of each step, (x, y, heading) in metres and radians; None where it is not told. Raises TraceError for one that is malformed."""
-    poses: list[Pose | None] = []
-    for t, step in enumerate(trace.steps):
-        value = step.truth.get("pose") if isinstance(step.truth, Mapping) else None
-        if value is None:
-            poses.append(None)
-        elif isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 3 and all(is_finite(number) for number in value):
-            poses.append((float(value[0]), float(value[1]), float(value[2])))
-        else:
-            raise TraceError(f"{trace.at(t)}: truth.pose: expected [x, y, heading] in metres and radians, got {brief(value)}; mend it")
-    return poses
+    told = [step.truth.get("pose") if isinstance(step.truth, Mapping) else None for step in trace.steps]
+    return [_pose(value, f"{trace.at(t)}: truth.pose") for t, value in enumerate(told)]
+
+
+def _pose(value: Any, where: str) -> Pose | None:
+    """A pose as JSON has it; None where there is none. Raises TraceError."""
+    if value is None:
+        return None
+    if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 3 and all(is_finite(number) for number in value):
+        return float(value[0]), float(value[1]), float(value[2])
+    raise TraceError(f"{where}: expected [x, y, heading] in metres and radians, got {brief(value)}; mend it")
 
 
 class _Poses:
@@ -215,6 +216,7 @@ class _Related:
     def __init__(self, trace: Trace, relations: Relations) -> None:
         self._relations = relations
         self._times = [_time(step.extra.get("time"), trace.at(t)) for t, step in enumerate(trace.steps)]
+        self._seen = [_pose(step.extra.get("seen"), f"{trace.at(t)}: seen") or (0.0, 0.0, 0.0) for t, step in enumerate(trace.steps)]
         self.told = np.array([relations.covers(time) for time in self._times])
         if not self.told.any():
             began, ended = relations.times[0], relations.times[-1]
@@ -224,9 +226,15 @@ class _Related:
             )
 
     def seen_from(self, step: int) -> tuple[Array, Array, Array]:
-        """The same, by relations."""
-        seen = self._relations.between(self._times, step)
-        dx, dy, turned, way = np.array([(math.nan,) * 4 if one is None else (*one[0], one[1]) for one in seen]).T
+        """The same, by relations between where the robot was, and by where it saw the dstates from there."""
+        robots = self._relations.between(self._times, step)
+        origin = self._seen[step]
+        dx, dy, turned, way = np.array(
+            [
+                (math.nan,) * 4 if robot is None else (*between(origin, moved(robot[0], seen)), robot[1])
+                for robot, seen in zip(robots, self._seen, strict=True)
+            ]
+        ).T
         return np.hypot(dx, dy), _degrees(turned), DOUBT + DOUBT_OF_WAY * way
 
 
