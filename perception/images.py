@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,21 +21,11 @@ def images_of(trace: Trace) -> NDArray[np.float64]:
 
     Raises PerceptionError where a step has no image, lengths differ, or the sidecar file cannot be read.
     """
-    held = [step.image for step in trace.steps]
-    for i, image in enumerate(held):
-        if image is None:
+    for i, step in enumerate(trace.steps):
+        if step.image is None:
             raise PerceptionError(f"{trace.at(i)}: image: expected one, got none; log an image at each step")
-    if any(isinstance(image, int) for image in held):
-        table = _sidecar(trace)
-        rows: list[Any] = []
-        for i, image in enumerate(held):
-            if isinstance(image, int) and image >= len(table):
-                raise PerceptionError(
-                    f"{trace.at(i)}: image: expected an index below {len(table)}, got {image}; {trace.images} has no more"
-                )
-            rows.append(table[image] if isinstance(image, int) else image)
-        held = rows
-    lengths = [len(image) for image in held]  # type: ignore[arg-type]
+    held = images_held(trace)
+    lengths = [len(image) for image in held]  # type: ignore[arg-type]  # as each step has one
     if not lengths[0]:
         raise PerceptionError(f"{trace.at(0)}: image: expected at least one range, got none; log what the robot saw")
     for i, beams in enumerate(lengths):
@@ -43,6 +33,20 @@ def images_of(trace: Trace) -> NDArray[np.float64]:
             mend = "give every image the same number of beams"
             raise PerceptionError(f"{trace.at(i)}: image: expected {lengths[0]} ranges, as the first has, got {beams}; {mend}")
     return np.array(held, dtype=float)
+
+
+def images_held(trace: Trace) -> list[NDArray[np.float64] | None]:
+    """The image of each step, (d,) ranges in metres; None where a step has none. Raises PerceptionError where the sidecar file cannot be read."""
+    held = [step.image for step in trace.steps]
+    if not any(isinstance(image, int) for image in held):
+        return [None if image is None else np.array(image, dtype=float) for image in held]
+    table = _sidecar(trace)
+    rows: list[NDArray[np.float64] | None] = []
+    for i, image in enumerate(held):
+        if isinstance(image, int) and image >= len(table):
+            raise PerceptionError(f"{trace.at(i)}: image: expected an index below {len(table)}, got {image}; {trace.images} has no more")
+        rows.append(None if image is None else table[image] if isinstance(image, int) else np.array(image, dtype=float))
+    return rows
 
 
 def _sidecar(trace: Trace) -> NDArray[np.float64]:

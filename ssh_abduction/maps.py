@@ -208,12 +208,13 @@ class SSHMap:
         for s in visited:
             faced.setdefault(s.path, s.direction)
         dstates = tuple(
-            replace(
-                s,
-                id=number[s.id],
-                place=place.get(s.place),
-                path=path.get(s.path),
-                direction=None if s.direction is None else 1 if s.direction == faced[s.path] else -1,
+            DState(
+                number[s.id],
+                s.view,
+                place.get(s.place),
+                path.get(s.path),
+                None if s.direction is None else 1 if s.direction == faced[s.path] else -1,
+                s.heading,
             )
             for s in visited
         )

@@ -2,26 +2,51 @@
 
 from __future__ import annotations
 
+import argparse
 import gzip
 import http.client
 import json
 import shutil
+import socket
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from ssh_abduction import DState, Listing, MapError, Solution, SSHMap, Theory, Trace, solve, view_page
+from ssh_abduction import (
+    Action,
+    DState,
+    Listing,
+    Localiser,
+    MapError,
+    Solution,
+    SSHMap,
+    Step,
+    Theory,
+    Trace,
+    TraceError,
+    solve,
+    view_page,
+)
+from ssh_abduction.asp.process import _under_way
 from ssh_abduction.cli import main
+from ssh_abduction.cli.options import add_theory, flags_of, theory_of
+from ssh_abduction.maps import Fault
 from ssh_abduction.maps import Path as MapPath
 from ssh_abduction.rivals.page.content import content_of
+from ssh_abduction.rivals.page.html import Page
+from ssh_abduction.rivals.page.images import ALPHABET, LOST, beams_of, drawn_images
 from ssh_abduction.rivals.page.server import PageServer
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ROUTE = EXAMPLES / "aces3-route.jsonl"
 EVIL = "<script>alert(1)</script>"
+HOSTILE = [EVIL, "</script><b>", '"onload="alert(1)', "\u2028-->", "<!--<script>"]
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +59,13 @@ def rivals(route: Trace) -> Solution:
     return solve(route)
 
 
-def test_overview_counts_the_maps_that_have_each_place(route: Trace, rivals: Solution) -> None:
-    overview = content_of(rivals, route)["overview"]
+@pytest.fixture(scope="module")
+def content(route: Trace, rivals: Solution) -> dict[str, Any]:
+    return content_of(rivals, route)
+
+
+def test_overview_counts_the_maps_that_have_each_place(route: Trace, rivals: Solution, content: dict[str, Any]) -> None:
+    overview = content["overview"]
     told = {tuple(node["steps"]): node["maps"] for node in overview["nodes"]}
     counted: dict[tuple[int, ...], int] = {}
     for ssh_map in rivals:
@@ -47,15 +77,83 @@ def test_overview_counts_the_maps_that_have_each_place(route: Trace, rivals: Sol
     assert min(told.values()) < max(told.values()) == len(rivals) == 4
 
 
+def hostile() -> tuple[Solution, Trace]:
+    """A trace of which each text that the page shows tries to be HTML, and its maps, one of whose views is disbelieved."""
+    trace = Trace.from_steps(views=[*HOSTILE, EVIL], actions=HOSTILE)
+    trace = replace(trace, name=EVIL)
+    solution = solve(trace, Theory.causal())
+    faulty = replace(solution.maps[0], faults=(Fault(1, "misread", EVIL, "</script>", 1.0),))
+    return replace(solution, maps=(faulty,)), trace
+
+
 def test_page_is_one_file_that_loads_nothing_and_keeps_texts_as_texts() -> None:
-    trace = Trace.from_steps(views=[EVIL, "</script><b>", EVIL], actions=["travel", "around"])
-    html = view_page(solve(trace), trace).html
-    assert EVIL not in html
-    assert "<b>" not in html
+    solution, trace = hostile()
+    html = view_page(solution, trace, run=trace[:3], beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace[:3])).html
+    for text in [*HOSTILE, "<b>", "\u2028"]:
+        assert text not in html.replace('"onload="', "") or text == "<script>"
     assert html.count("<script") == html.count("</script>") == 2
     assert "default-src 'none'" in html
     assert "http://" not in html.replace("http://www.w3.org/2000/svg", "")
     assert "https://" not in html
+
+
+def test_ranges_are_drawn_at_the_bearings_that_the_header_says() -> None:
+    images = [(1.0, float("inf"), 2.0, float("nan")), (4.0, 1.0, 2.0, 4.0)]
+    steps = tuple(Step("v", image=image, action=Action("on") if k == 0 else None) for k, image in enumerate(images))
+    trace = Trace(steps, extra={"beams": {"first": -30, "step": 20}})
+    drawn = drawn_images(trace)
+    assert drawn is not None
+    assert (drawn["first"], drawn["step"]) == (-30.0, 20.0)
+    first = drawn["images"][0]
+    assert first[1] == ALPHABET[-1]  # nothing came back: as far as is drawn
+    assert first[3] == LOST
+    assert ALPHABET.index(first[2]) == pytest.approx(2 * ALPHABET.index(first[0]), abs=1)
+    assert [beams_of(Trace(steps), count) for count in (180, 181, 361)] == [(-89.5, 1.0), (-90.0, 1.0), (-90.0, 0.5)]
+    with pytest.raises(TraceError, match="go round once at most"):
+        drawn_images(replace(trace, extra={"beams": {"first": 0, "step": 200}}))
+
+
+def test_images_of_a_sidecar_file_and_panoramas_are_shown(tmp_path: Path) -> None:
+    shape = [2, 3, 1]
+    np.savez(tmp_path / "images.npz", images=np.arange(12).reshape(2, 6) * 20)
+    steps = (Step("a", Action("on"), image=1), Step("b", image=0))
+    trace = Trace(steps, images="images.npz", extra={"panorama": shape}, source=str(tmp_path / "trace.jsonl"))
+    drawn = drawn_images(trace)
+    assert drawn is not None
+    assert (drawn["kind"], drawn["rows"], drawn["columns"]) == ("panorama", 2, 3)
+    assert drawn["images"][1][0] == ALPHABET[0]
+    assert drawn["images"][0][0] > drawn["images"][1][0]
+    (tmp_path / "images.npz").unlink()
+    with pytest.warns(UserWarning, match="the page is made without images"):
+        assert drawn_images(trace) is None
+
+
+def test_beliefs_are_those_of_the_localiser_in_each_rival() -> None:
+    trace = Trace.from_steps("abcbabcb", ["on"] * 7)
+    solution = solve(trace, Theory.causal())
+    found = view_page(solution, trace, run=trace, beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace)).content
+    (replayed,) = found["replays"]
+    assert list(replayed["beliefs"]) == [str(number) for number in dict.fromkeys(told["labeling"] for told in found["maps"])]
+    for (verdict, nowhere, likely), belief in zip(replayed["beliefs"]["0"], Localiser(solution.maps[0]).beliefs(trace), strict=True):
+        assert verdict == belief.verdict.value
+        assert nowhere == pytest.approx(belief.nowhere, abs=1e-3)
+        assert likely[0] == [belief.likeliest, pytest.approx(belief.probability, abs=1e-3)]
+    other = view_page(solution, trace, run=trace[2:6], beliefs=lambda ssh_map: None).content
+    assert [len(one["steps"]) for one in other["replays"]] == [4, 8]
+    with pytest.raises(MapError, match="expected 4, one for each step"):
+        view_page(solution, trace, run=trace[2:6], beliefs=lambda ssh_map: [])
+
+
+def test_flags_of_a_theory_make_it_again() -> None:
+    parser = argparse.ArgumentParser()
+    add_theory(parser)
+    for theory in (
+        Theory.topological(),
+        Theory.causal(),
+        Theory.topological().replace(misread=1.5, boundary="none", same=((0, 4), (1, 5)), different=((2, 3),), symmetric_sides=False),
+        Theory.topological().replace(without=("side_of_branch",), prefer=("dstates", "places"), joint=1, reject=0.01),
+    ):
+        assert theory_of(parser.parse_args(flags_of(theory))) == theory
 
 
 def test_page_of_many_maps_of_500_dstates_is_small() -> None:
@@ -74,15 +172,30 @@ def test_trace_of_other_maps_is_refused(rivals: Solution, route: Trace) -> None:
         view_page(rivals, route[:5])
 
 
-def test_view_writes_a_page(tmp_path: Path, rivals: Solution, capsys: pytest.CaptureFixture[str]) -> None:
-    rivals.save(tmp_path / "maps.json")
-    assert main(["view", str(tmp_path / "maps.json"), "-o", str(tmp_path / "page.html")]) == 0
-    assert (tmp_path / "page.html").read_text().startswith("<!doctype html>")
-    assert main(["view", str(tmp_path / "maps.json"), "--serve"]) == 1
-    assert "expected the trace that was mapped" in capsys.readouterr().err
+def test_view_writes_a_page_with_beliefs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trace = Trace.from_steps("abcbabcb", ["on"] * 7)
+    maps, run, page = (str(tmp_path / name) for name in ("maps.json", "it's.jsonl", "page.html"))
+    solve(trace, Theory.causal()).save(maps)
+    trace.save(run)
+    assert main(["localize", maps, run, "--json"]) == 0
+    (tmp_path / "beliefs.json").write_text(capsys.readouterr().out)
+    assert main(["view", maps, run, "--belief", str(tmp_path / "beliefs.json"), "-o", page]) == 0
+    shown = shown_in(page)
+    assert main(["view", maps, run, "--localize", run, "-o", page]) == 0
+    again = shown_in(page)
+    assert shown["replays"][0]["beliefs"]["0"] == again["replays"][0]["beliefs"]["0"]
+    assert shown["flags"] == " --theory causal"
+    assert shown["trace"] == f"'{tmp_path}/it'\"'\"'s.jsonl'"
+    for wrong, said in ((["--serve"], "expected the trace that was mapped"), (["--belief", maps], "beliefs: expected a list")):
+        assert main(["view", maps, *([run] if wrong[1:] else []), *wrong, "--no-open"]) == 1
+        assert said in capsys.readouterr().err
 
 
-@pytest.fixture
+def shown_in(page: str) -> Any:
+    return json.loads(Path(page).read_text().partition('<script type="application/json" id="content">')[2].partition("</script>")[0])
+
+
+@pytest.fixture(scope="module")
 def server(rivals: Solution, route: Trace) -> Iterator[PageServer]:
     with PageServer(Listing.of(rivals), route, rivals.theory) as served:
         thread = threading.Thread(target=served.serve_forever, args=(0.05,))
@@ -110,6 +223,31 @@ def test_server_answers_only_who_knows_its_token_from_this_computer(server: Page
     assert asked(server, "GET", own, Host="evil.example") == (403, b"")
     assert asked(server, "POST", own + "solve", {}, Origin="http://evil.example") == (403, b"")
     assert asked(server, "POST", "/solve", {}) == (403, b"")
+    assert asked(server, "PUT", own, {}) == (403, b"")
+    assert asked(server, "POST", own + "solve", {"same": "x" * 200_000}) == (403, b"")
+
+
+def test_question_whose_asker_is_gone_is_given_up(server: PageServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = server.url.partition(str(server.port))[2]
+    monkeypatch.setattr("ssh_abduction.rivals.page.server._solved", sleep)
+    with socket.create_connection(("127.0.0.1", server.port)) as connection:
+        connection.sendall(
+            f"POST {own}solve HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{{}}".encode()
+        )
+        until(lambda: bool(_under_way))
+    until(lambda: not _under_way)
+    assert b"expected a pair" in asked(server, "POST", own + "explain", {})[1]
+
+
+def sleep(*arguments: object) -> None:
+    time.sleep(60)
+
+
+def until(happened: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 def test_server_solves_under_what_is_assumed_and_explains(server: PageServer, route: Trace) -> None:
@@ -119,6 +257,7 @@ def test_server_solves_under_what_is_assumed_and_explains(server: PageServer, ro
     assert not any(entry["labels"][0] == entry["labels"][9] for entry in told["content"]["labelings"])
     why = json.loads(asked(server, "POST", own + "explain", {"pair": [0, 2]})[1])
     assert "steps 0 and 2 are different dstates" in why["text"]
+    assert why["assuming"]["different"] == "costs nothing, as it holds in every map"
     wrong = json.loads(asked(server, "POST", own + "explain", {"pair": [0, 99]})[1])
     assert "from 0 to 22" in wrong["error"]
 
@@ -131,7 +270,14 @@ def browser() -> Iterator[Any]:
         pytest.skip("no chromium with its driver on this machine")
     options = webdriver.ChromeOptions()
     options.binary_location = chromium
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--window-size=1280,900"):
+    for argument in (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-dev-shm-usage",
+        "--disable-background-networking",
+        "--window-size=1280,900",
+    ):
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     chrome = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
@@ -171,9 +317,9 @@ class Shown:
         return [entry["message"] for entry in self.browser.get_log("browser") if "favicon" not in entry["message"]]
 
 
-def test_page_in_the_browser(browser: Any, tmp_path: Path, rivals: Solution, route: Trace) -> None:
+def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, Any]) -> None:
     file = tmp_path / "page.html"
-    view_page(rivals, route).save(file)
+    Page(content).save(file)
     page = Shown(browser, file.as_uri())
     assert (
         page["sentence"].text
@@ -193,18 +339,25 @@ def test_page_in_the_browser(browser: Any, tmp_path: Path, rivals: Solution, rou
     page.choose(0, 2)
     assert page["verdict"].text.startswith("Steps 0 and 2: different dstates in every minimal map")
     page.click("same")
-    assert page["answer"].text == "ssh-abduction solve TRACE --json --same 0,2 > maps.json"
+    assert page["answer"].text.startswith(
+        "ssh-abduction solve TRACE --json --same 0,2 > assumed.json\nssh-abduction view assumed.json TRACE"
+    )
+    assert "more than the 19 dstates" in page["costs"].text
     browser.set_window_size(500, 900)
     assert browser.execute_script("return document.documentElement.scrollWidth <= window.innerWidth")
     browser.set_window_size(1280, 900)
     assert page.complaints == []
 
 
-def test_hostile_view_stays_text_in_the_browser(browser: Any, tmp_path: Path) -> None:
-    trace = Trace.from_steps(views=[EVIL, "wall", EVIL], actions=["travel", "around"])
-    view_page(solve(trace), trace).save(tmp_path / "page.html")
+def test_hostile_texts_stay_texts_in_the_browser(browser: Any, tmp_path: Path) -> None:
+    solution, trace = hostile()
+    view_page(solution, trace, run=trace[:3], beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace[:3])).save(tmp_path / "page.html")
     page = Shown(browser, (tmp_path / "page.html").as_uri())
     assert EVIL in page["seen"].text  # an alert would have made this an error
+    assert EVIL in page["which"].get_attribute("textContent")
+    browser.execute_script("chooseReplay(1); setStep(1); pick(0); pick(1)")
+    assert EVIL in page["wrong"].text
+    assert browser.execute_script("return document.querySelectorAll('script, iframe, img, b').length") == 2
     assert page.complaints == []
 
 
@@ -213,8 +366,8 @@ def test_assuming_and_explaining_in_the_browser(browser: Any, server: PageServer
     page.click("one")
     page.choose(0)
     page.browser.execute_script("const i = document.getElementById('later'); i.value = 9; i.dispatchEvent(new Event('change'))")
-    page.click("why")
-    page.until("answer", "one dstate in every minimal map")
+    page.until("answer", "one dstate in every minimal map")  # which is asked as soon as two are chosen
+    assert "20 dstates, not 19" in page["costs"].text
     page.click("different")
     page.until("answer", "With steps 0 and 9 assumed different: optimal: 20 dstates")
     assert "--different 0,9" in page["sentence"].text

@@ -6,13 +6,14 @@ import argparse
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from ssh_abduction.errors import MapError, SSHError, named
 from ssh_abduction.maps import read_json
-from ssh_abduction.theory.theory import CHOICES, COUNTS, EXCUSED, PRESETS, Theory
+from ssh_abduction.theory.theory import ASSERTIONS, CHOICES, COUNTS, EXCUSED, PRESETS, Theory
 from ssh_abduction.trace import Trace
 
 Verbs = Any  # argparse's type for what add_subparsers returns is private
@@ -118,3 +119,30 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
         return found.replace(**chosen)
     preset = "causal" if chosen.get("level") == "causal" else "topological"
     return PRESETS[options.theory or preset]().replace(**chosen)
+
+
+def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
+    """The flags that make a command take this theory: the inverse of `theory_of`.
+
+    trace  the trace that it is for: what the default theory settles for it needs no flag
+    """
+    default = Theory.causal() if theory.level == "causal" else Theory.topological()
+    flags = ["--theory", "causal"] if theory.level == "causal" else []
+    if trace is not None:
+        with suppress(SSHError):  # the theory was made for a trace that has what the default asks for; this one may be another
+            default = default.resolve(trace)
+    for field in fields(Theory):
+        value, flag = getattr(theory, field.name), f"--{field.name.replace('_', '-')}"
+        if value == getattr(default, field.name) or field.name in ("level", "returns"):
+            continue
+        if isinstance(value, bool):
+            flags.append(flag if value else f"--no-{flag[2:]}")
+        elif field.name == "rules":
+            flags += [part for rules in value for part in (flag, rules.name)]
+        elif field.name in ASSERTIONS:
+            flags += [part for i, j in value for part in (flag, f"{i},{j}")]
+        elif isinstance(value, tuple):
+            flags += [flag, ",".join(value)]
+        else:
+            flags += [flag, f"{value:g}" if isinstance(value, float) else str(value)]
+    return flags

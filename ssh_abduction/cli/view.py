@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import Verbs
-from ssh_abduction.errors import SSHError
+from ssh_abduction.cli.options import Verbs, flags_of
+from ssh_abduction.errors import MapError, SSHError, brief, is_whole, named
+
+if TYPE_CHECKING:
+    from ssh_abduction.rivals.listing import Listing
+    from ssh_abduction.rivals.page.content import Called, Run
+    from ssh_abduction.theory.theory import Theory
+    from ssh_abduction.trace import Trace
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -14,6 +23,12 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("maps", help="what solve --json printed, or one saved map; - for standard input")
     parser.add_argument("trace", nargs="?", help="the trace that was mapped: for its actions and laser images, and for --serve")
     parser.add_argument("-o", "--output", metavar="FILE", help="write the page to this file, and do not open it")
+    localised = (
+        "also replay this run of a robot, with the belief where it may be at each step, in each rival. It may be TRACE itself. It is localised by its views, or as "
+        "--belief says"
+    )
+    parser.add_argument("--localize", metavar="RUN", help=localised)
+    parser.add_argument("--belief", metavar="FILE", help="what localize --json printed of the run of --localize, or of TRACE")
     serve = (
         "serve the page on this computer alone, so that it can explain, and solve again under what is assumed; needs TRACE. Ctrl-C ends it"
     )
@@ -28,8 +43,9 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.maps import read_json
     from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.rivals.page.content import content_of  # which loads numpy
+    from ssh_abduction.rivals.page.content import Called, content_of  # which loads numpy
     from ssh_abduction.rivals.page.html import Page
+    from ssh_abduction.theory.theory import Theory
     from ssh_abduction.trace import Trace
 
     if options.serve and options.trace is None:
@@ -42,25 +58,73 @@ def run(options: argparse.Namespace) -> int:
     source = "standard input" if options.maps == "-" else options.maps
     listing = Listing.from_dict(data, source)
     trace = Trace.load(options.trace) if options.trace is not None else None
+    theory = Theory.from_dict(data["theory"]) if isinstance(data, dict) and "theory" in data else None
+    flags = "" if theory is None else "".join(f" {shlex.quote(flag)}" for flag in flags_of(theory, trace))
+    called = Called(shlex.quote(options.maps), shlex.quote(options.trace) if options.trace else "TRACE", flags)
+    localised = _run(options, trace, data)
     if options.serve:
         assert trace is not None
-        return _serve(listing, trace, data, options)
-    page = Page(content_of(listing, trace, name=source, trace_name=options.trace or "TRACE"))
+        return _serve(options, listing, trace, theory, localised, called)
+    page = Page(content_of(listing, trace, localised, called))
     file = options.output or _temporary()
     page.save(file)
     print(file)
     if not options.output and not options.no_open:
-        _open(f"file://{file}")
+        _open(Path(file).absolute().as_uri())
     return 0
 
 
-def _serve(listing: object, trace: object, data: object, options: argparse.Namespace) -> int:
-    from ssh_abduction.rivals.page.server import PageServer
-    from ssh_abduction.theory.theory import Theory
+def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
+    """The run that is localised, if one was asked for. Raises SSHError."""
+    from ssh_abduction.rivals.page.content import Run
+    from ssh_abduction.trace import Trace
 
-    theory = Theory.from_dict(data["theory"]) if isinstance(data, dict) and "theory" in data else None
+    if options.localize is None and options.belief is None:
+        return None
+    followed = Trace.load(options.localize) if options.localize is not None else trace
+    if followed is None:
+        raise SSHError("--belief: expected the run that it is of, got none; name it with --localize, or give the trace that was mapped")
+    if options.belief is None:
+        from ssh_abduction.localize import Localiser
+
+        return Run(followed, lambda ssh_map: Localiser(ssh_map).beliefs(followed))
+    return _with_beliefs(followed, options.belief, data)
+
+
+def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
+    """The run with the beliefs in a file. Raises MapError."""
+    from ssh_abduction.maps import maps_of, read_json
+    from ssh_abduction.rivals.page.content import Run
+
+    told = read_json(file)
+    beliefs = told.get("beliefs") if isinstance(told, dict) else None
+    if not isinstance(beliefs, list) or not all(isinstance(belief, dict) for belief in beliefs):
+        raise MapError(f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write them with localize --json")
+    maps, number = maps_of(data, "maps"), told.get("map", 1)
+    if not is_whole(number) or not 1 <= number <= len(maps) or told.get("dstates", count := len(maps[number - 1].dstates)) != count:
+        raise MapError(f"{named(file)}: map: expected one of the {len(maps)} maps, got {brief(number)}; localise in these maps again")
+    if len(beliefs) != len(followed):
+        raise MapError(
+            f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, got {len(beliefs)}; name that run with --localize"
+        )
+    chosen, labels = maps[number - 1], maps[number - 1].renumbered().labels
+    visited = dict.fromkeys([*chosen.labels, *range(len(chosen.dstates))])
+    new = {s: i for i, s in enumerate(visited)}  # the page numbers dstates by first visit
     try:
-        server = PageServer(listing, trace, theory, port=options.port, limit=options.time_limit)  # type: ignore[arg-type]
+        renumbered = [{**belief, "probabilities": [[new[s], p] for s, p in belief["probabilities"]]} for belief in beliefs]
+    except (KeyError, TypeError, ValueError):
+        raise MapError(f"{named(file)}: probabilities: expected pairs [dstate, probability], got something else; localise again") from None
+    return Run(followed, lambda ssh_map: renumbered if ssh_map.labels == labels else None)
+
+
+def _serve(
+    options: argparse.Namespace, listing: Listing, trace: Trace, theory: Theory | None, localised: Run | None, called: Called
+) -> int:
+    from ssh_abduction.asp.process import end_all
+    from ssh_abduction.rivals.page.server import PageServer
+
+    try:
+        server = PageServer(listing, trace, theory, run=localised, called=called, port=options.port, limit=options.time_limit)
     except OSError as error:
         raise SSHError(f"--port: expected a free port, got {options.port}: {error.strerror}; name another one") from None
     with server:
@@ -71,12 +135,13 @@ def _serve(listing: object, trace: object, data: object, options: argparse.Names
             server.serve_forever()
         except KeyboardInterrupt:
             return 0
+        finally:
+            end_all()
     return 0
 
 
 def _temporary() -> str:
     import tempfile
-    from pathlib import Path
 
     return str(Path(tempfile.mkdtemp(prefix="ssh-abduction-")) / "maps.html")
 

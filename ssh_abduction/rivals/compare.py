@@ -200,12 +200,14 @@ class Comparison:
         count = len(self.ids) if self.minimal is None else self.minimal
         minimal = "minimal " if self.minimal is not None else ""
         told = f"{'at least ' if self.complete is False else ''}{count} {minimal}map{'' if count == 1 else 's'}"
-        if self.complete is False and self.stopped:
+        if self.complete is False and self.stopped == "no proof":
+            told = f"{count} {minimal}map{'' if count == 1 else 's'}, without a proof that there {'is' if count == 1 else 'are'} no other{'' if count == 1 else 's'}"
+        elif self.complete is False and self.stopped:
             told += f" (listing was {'' if self.stopped == 'interrupted' else 'stopped by the '}{self.stopped})"
         more = len(self.ids) - count
         if more:
             told += f", and {more} larger ones"
-        if count == 1 and not more and self.complete is not False:
+        if count == 1 and not more and (self.complete is not False or self.stopped == "no proof"):
             return told
         told += f": {self._differences}"
         if self.complete is False and not self.shared.proven:

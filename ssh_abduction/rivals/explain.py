@@ -143,6 +143,26 @@ class PairExplanation:
             known = f"the best map {rival}" if lost.proven else f"the best map {rival} that was found"
             yield f"{known} has {_difference(lost.cost, won.cost, self.theory)}"
 
+    @property
+    def assuming(self) -> dict[str, str]:
+        """What it costs to assume that the steps are one dstate (`same`), and that they are not (`different`), in words."""
+        sides = {"same": self.same, "different": self.different}
+        best = min((s.cost for s in sides.values() if s.cost), key=lambda cost: cost.preferred_by(self.theory), default=None)
+        told = {}
+        for name, side in sides.items():
+            other = self.different if side is self.same else self.same
+            if side.possible is False:
+                told[name] = "no map satisfies the axioms"
+            elif other.possible is False:
+                told[name] = "costs nothing, as it holds in every map"
+            elif side.cost is None or best is None:
+                told[name] = "what it costs was not found out"
+            elif side.cost.preferred_by(self.theory) == best.preferred_by(self.theory):
+                told[name] = f"costs nothing: {_told(side.cost, self.theory.priorities)}"
+            else:
+                told[name] = f"{'' if side.proven else 'at most, '}{_difference(side.cost, best, self.theory)}"
+        return told
+
     def __str__(self) -> str:
         lines = list(self.sentences)
         if self.derivation:

@@ -6,15 +6,17 @@ import base64
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path as FilePath
 from typing import Any
 
+from ssh_abduction.errors import MapError
 from ssh_abduction.files import write_file
+from ssh_abduction.maps import SSHMap
 from ssh_abduction.rivals.listing import Maps
-from ssh_abduction.rivals.page.content import content_of
+from ssh_abduction.rivals.page.content import Run, content_of
 from ssh_abduction.trace import Trace
 
 HERE = FilePath(__file__).parent
@@ -46,15 +48,26 @@ class Page:
         return widget_of(self.html)
 
 
-def view_page(source: Maps, trace: Trace | None = None) -> Page:
+def view_page(
+    source: Maps,
+    trace: Trace | None = None,
+    *,
+    run: Trace | None = None,
+    beliefs: Callable[[SSHMap], Iterable[Any] | None] | None = None,
+) -> Page:
     """A page that shows maps, what they share and where they differ.
 
-    source  a solution, or maps of one trace
-    trace   the trace that was mapped, for its actions and laser images
+    source   a solution, or maps of one trace
+    trace    the trace that was mapped, for its actions and images
+    run      what the slider replays with a belief at each step; it may be the trace itself
+    beliefs  where the robot of this run may have been: gives for a map the beliefs over its dstates, one for each step, as `lambda m: Localiser(m).beliefs(run)` does;
+             or None, for a map in which it was not localised
 
-    Raises MapError for maps of several traces, or of another one than this.
+    Raises MapError for maps of several traces, or of another one than this, and for beliefs without a run, or the other way round.
     """
-    return Page(content_of(source, trace))
+    if (run is None) != (beliefs is None):
+        raise MapError("beliefs: expected a run that they are of, and beliefs for a run, got one of the two; give both, or none")
+    return Page(content_of(source, trace, None if run is None or beliefs is None else Run(run, beliefs)))
 
 
 def html_of(content: Mapping[str, Any], *, served: bool = False) -> str:

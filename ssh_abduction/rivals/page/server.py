@@ -2,6 +2,8 @@
 
 Only who knows the token in its address is answered, and only where the request names this computer as its host: so no other page in the browser can ask (DNS rebinding
 included), and no other computer.
+
+A question is answered in a process of its own. So it can be given up: when the page closes the connection, as it does when the user asks something else, that process is ended.
 """
 
 from __future__ import annotations
@@ -9,22 +11,32 @@ from __future__ import annotations
 import hmac
 import json
 import secrets
+import select
+import socket
+import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
+from ssh_abduction.asp.limits import LimitError, Watch
+from ssh_abduction.asp.process import in_process
 from ssh_abduction.errors import MapError, SSHError, brief, is_whole
-from ssh_abduction.rivals.explain import explain_pair
+from ssh_abduction.rivals.explain import PairExplanation, explain_pair
 from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.rivals.page.content import content_of
+from ssh_abduction.rivals.page.content import Called, Run, content_of
 from ssh_abduction.rivals.page.html import html_of
+from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
 LARGEST = 100_000  # bytes of a question
+POLL = 0.1  # seconds after which it is looked whether who asked is still there
+# An answer has so many times its limit and so many seconds more, for the process to begin and for what cannot be interrupted, before the process is ended.
+NET, MORE = 1.2, 2.0
 
 
 class PageServer(ThreadingHTTPServer):
@@ -38,10 +50,20 @@ class PageServer(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(
-        self, listing: Listing, trace: Trace, theory: Theory | None = None, *, port: int = 0, maps: int = 100, limit: float | None = 30.0
+        self,
+        listing: Listing,
+        trace: Trace,
+        theory: Theory | None = None,
+        *,
+        run: Run | None = None,
+        called: Called | None = None,
+        port: int = 0,
+        maps: int = 100,
+        limit: float | None = 30.0,
     ) -> None:
         self._trace, self._theory, self._maps, self._limit = trace, theory, maps, limit
-        self._content = content_of(listing, trace, name=listing.source)
+        self._run, self._called = run, called or Called(listing.source)
+        self._page = html_of(content_of(listing, trace, run, self._called), served=True).encode()
         self._token = secrets.token_urlsafe(24)
         self._one_at_a_time = threading.Lock()
         super().__init__(("127.0.0.1", port), _Handler)
@@ -59,22 +81,44 @@ class PageServer(ThreadingHTTPServer):
         token, _, rest = path.partition("?")[0].lstrip("/").partition("/")
         return rest if hmac.compare_digest(token.encode(), self._token.encode()) else None
 
-    def page(self) -> str:
-        return html_of(self._content, served=True)
+    def page(self) -> bytes:
+        return self._page
 
-    def answer(self, question: str, data: Mapping[str, Any]) -> dict[str, Any]:
-        """The answer to a question of the page. Raises SSHError."""
-        with self._one_at_a_time:
-            if question == "explain":
-                first, second = self._pair(data.get("pair"))
-                theory = self._assuming(data)
-                return {"text": str(explain_pair(self._trace, first, second, theory, limit=self._limit))}
-            if question == "solve":
-                found = solve(self._trace, self._assuming(data), maps=self._maps, limit=self._limit)
-                if not found.maps:
-                    return {"text": found.headline}
-                return {"text": found.headline, "content": content_of(found, self._trace, name=self._content["file"])}
-        raise MapError(f"expected explain or solve, got {brief(question)}")
+    def answer(self, question: str, data: Mapping[str, Any], watch: Watch) -> dict[str, Any]:
+        """The answer to a question of the page. Raises SSHError, and LimitError when the watch says so."""
+        if question not in ("explain", "solve"):
+            raise MapError(f"expected explain or solve, got {brief(question)}")
+        theory = self._assuming(data)
+        pair = self._pair(data.get("pair")) if question == "explain" else None
+        with self._turn(watch):
+            if pair is not None:
+                why = in_process(_explained, self._trace, *pair, theory, self._limit, watch=watch)
+                return {"text": str(why), "assuming": why.assuming}
+            found = in_process(_solved, self._trace, theory, self._maps, self._limit, watch=watch)
+        if not found.maps:
+            return {"text": found.headline}
+        return {"text": found.headline, "content": content_of(found, self._trace, self._run, self._called)}
+
+    @contextmanager
+    def _turn(self, watch: Watch) -> Iterator[None]:
+        """One question at a time has the processor; who gave up while waiting waits no longer."""
+        while not self._one_at_a_time.acquire(timeout=POLL):
+            watch.check()
+        try:
+            watch.start()  # the time that was waited does not count
+            yield
+        finally:
+            self._one_at_a_time.release()
+
+    @property
+    def net(self) -> float | None:
+        """Seconds after which the process of an answer is ended."""
+        return None if self._limit is None else NET * self._limit + MORE
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Whoever closes the connection before the answer is there is no error to be printed."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
 
     def _assuming(self, data: Mapping[str, Any]) -> Theory:
         theory = self._theory or Theory.topological()
@@ -99,7 +143,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if self._asked() == "":
-            self._send(HTTPStatus.OK, self.server.page().encode(), "text/html; charset=utf-8")
+            self._send(HTTPStatus.OK, self.server.page(), "text/html; charset=utf-8")
         else:
             self._refuse()
 
@@ -109,14 +153,20 @@ class _Handler(BaseHTTPRequestHandler):
         if not asked or not length.isdecimal() or int(length) > LARGEST or self.headers.get_content_type() != "application/json":
             self._refuse()
             return
+        watch = Watch(self.server.net)
+        watch.use_reserve()
         try:
             data = json.loads(self.rfile.read(int(length)))
             if not isinstance(data, dict):
                 raise MapError(f"expected an object, got {brief(data)}")
-            told = self.server.answer(asked, data)
+            with _while_there(self.connection, watch):
+                told = self.server.answer(asked, data, watch)
+        except LimitError as error:
+            told = {"error": f"none was found in time ({error.reason}); --time-limit gives it more"}
         except (SSHError, ValueError, RecursionError) as error:
             told = {"error": str(error)}
-        self._send(HTTPStatus.OK, json.dumps(told).encode(), "application/json")
+        if not watch.interrupted:
+            self._send(HTTPStatus.OK, json.dumps(told).encode(), "application/json")
 
     def _asked(self) -> str | None:
         """What is asked for, if who asks may."""
@@ -125,6 +175,10 @@ class _Handler(BaseHTTPRequestHandler):
         if self.headers.get("Host") not in hosts or (origin is not None and origin not in [f"http://{host}" for host in hosts]):
             return None
         return self.server.is_known(self.path)
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """What is no request for this server is refused as others are, without a word on what would be one."""
+        self._refuse()
 
     def _refuse(self) -> None:
         """An empty answer, and the connection is closed, as what follows in it was not read."""
@@ -147,3 +201,35 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing is logged, as addresses hold the token."""
+
+
+@contextmanager
+def _while_there(connection: socket.socket, watch: Watch) -> Iterator[None]:
+    """Meanwhile, interrupt the watch as soon as who asked closes the connection."""
+    done = threading.Event()
+
+    def look() -> None:
+        while not done.wait(POLL):
+            try:
+                if select.select([connection], [], [], 0)[0] and not connection.recv(1, socket.MSG_PEEK):
+                    watch.interrupted = True
+                    return
+            except (OSError, ValueError):  # it was reset, or closed here
+                watch.interrupted = True
+                return
+
+    looking = threading.Thread(target=look, daemon=True)
+    looking.start()
+    try:
+        yield
+    finally:
+        done.set()
+        looking.join()
+
+
+def _explained(trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch) -> PairExplanation:
+    return explain_pair(trace, first, second, theory, limit=limit)
+
+
+def _solved(trace: Trace, theory: Theory, maps: int, limit: float | None, watch: Watch) -> Solution:
+    return solve(trace, theory, maps=maps, limit=limit)

@@ -1,0 +1,109 @@
+"""The images of a trace as the page draws them: ranges of a laser round the robot, or panoramas; short enough for a page, and all on one scale.
+
+A number is one character of a text, which compresses better than digits. The alphabet has none that HTML or JSON would escape.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.errors import PerceptionError
+from perception.images import images_held
+from ssh_abduction.errors import TraceError, brief, is_finite, named
+from ssh_abduction.trace import Trace
+
+ALPHABET = "".join(chr(c) for c in range(35, 127) if chr(c) not in "&<>\\")
+LOST = "!"  # a beam that measured nothing
+MOST = 100_000  # characters that all images of a page may have together
+BEAMS, FEWEST = 181, 24  # beams of an image that are shown, and how few they may become before images are left out
+PIXELS = (12, 90)  # rows and columns of a panorama that are shown
+FAR = 95  # the longest range that is drawn: this percentile of all ranges, as a single look down a long corridor would make all rooms small
+HALF = 180.0
+
+
+def beams_of(trace: Trace, count: int) -> tuple[float, float]:
+    """The bearing of the first beam, and from each beam to the next, in degrees counterclockwise from straight ahead.
+
+    The header's `beams` says it. Without it the beams are taken to go from the right to the left over the half circle ahead, as those of the usual scanners do: of an odd
+    number the first is straight to the right, of an even one half a beam from there. Raises TraceError.
+    """
+    told = trace.extra.get("beams")
+    if told is None:
+        usual = HALF / (count - 1) if count % 2 and count > 1 else HALF / count
+        return -usual * (count - 1) / 2, usual
+    first = told.get("first") if isinstance(told, dict) else None
+    step = told.get("step") if isinstance(told, dict) else None
+    if not is_finite(first) or not is_finite(step) or step == 0 or abs(step) * (count - 1) > 360 + 1e-6:
+        raise TraceError(
+            f'{named(trace.source or "trace")}: beams: expected {{"first": degrees, "step": degrees}}, counterclockwise from straight ahead, with which {count} beams '
+            f"go round once at most, got {brief(told)}; mend the header, or leave it out"
+        )
+    return float(first), float(step)
+
+
+def drawn_images(trace: Trace) -> dict[str, Any] | None:
+    """The images of a trace; None where there are none, or too many for a page.
+
+    kind    ranges, with `first` and `step` (degrees counterclockwise) and `reach` (metres that the last character of the alphabet stands for), or panorama, with
+            `rows`, `columns` and `colours`
+    images  for each step a text, or None
+    """
+    try:
+        held = images_held(trace)
+    except PerceptionError as error:
+        warnings.warn(f"{error}; the page is made without images", stacklevel=2)
+        return None
+    known = [image for image in held if image is not None]
+    if not known:
+        return None
+    panorama = trace.extra.get("panorama")
+    if panorama is not None:
+        return _panoramas(held, panorama, MOST // len(known))
+    most = max(len(image) for image in known)
+    first, step = beams_of(trace, most)
+    every = max(-(-most // BEAMS), -(-most * len(known) // MOST))
+    if -(-most // every) < min(FEWEST, most):
+        return None
+    finite = [image[np.isfinite(image) & (image > 0)] for image in known]
+    ranges = np.concatenate(finite)
+    reach = float(np.percentile(ranges, FAR)) if len(ranges) else 1.0
+    return {
+        "kind": "ranges",
+        "first": round(first, 3),
+        "step": round(step * every, 4),
+        "reach": round(reach, 2),
+        "images": [None if image is None else _text(image[::every] / reach) for image in held],
+    }
+
+
+def _text(shares: NDArray[np.float64]) -> str:
+    """Numbers from 0 to 1 as characters: what is greater is as 1, and what is no number is LOST."""
+    last = len(ALPHABET) - 1
+    return "".join(LOST if math.isnan(x) else ALPHABET[round(last * min(max(x, 0.0), 1.0))] for x in shares.tolist())
+
+
+def _panoramas(held: Sequence[NDArray[np.float64] | None], shape: Any, each: int) -> dict[str, Any] | None:
+    """Panoramas of so many characters each at most, made smaller by leaving out rows and columns; None where the header's shape is not theirs."""
+    if not isinstance(shape, list) or len(shape) != 3 or any(not isinstance(n, int) or n < 1 for n in shape):
+        return None
+    if any(image is not None and len(image) != math.prod(shape) for image in held):
+        return None
+    rows, columns = min(PIXELS[0], shape[0]), min(PIXELS[1], shape[1])
+    while rows * columns * shape[2] > each:
+        if rows * columns == 1:
+            return None
+        rows, columns = max(1, rows // 2), max(1, columns // 2)
+    row, column = (np.linspace(0, n - 1, k).round().astype(int) for n, k in ((shape[0], rows), (shape[1], columns)))
+    return {
+        "kind": "panorama",
+        "rows": rows,
+        "columns": columns,
+        "colours": shape[2],
+        "images": [None if image is None else _text(image.reshape(shape)[row][:, column].ravel() / 255) for image in held],
+    }
