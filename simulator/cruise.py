@@ -18,8 +18,10 @@ from simulator.freespace import CELL, Cells, FreeSpace
 from simulator.laser import BEARINGS
 
 Array = NDArray[np.float64]
-# Metres that the robot drives from image to image, and at which point of its way it aims.
-STRIDE, AIM = 0.1, 0.5
+# Metres that the robot drives from image to image.
+STRIDE = 0.1
+# Metres along the way to where the robot aims; it aims CLOSE where something is not farther off than WIDE, so that it cuts no corner there.
+AIM, CLOSE, WIDE = 0.5, 0.2, 0.6
 # Radians that the robot turns in a stride, and from which on it turns on the spot.
 BEND, SHARP = math.radians(20), math.radians(50)
 # Metres within which obstacles are heeded, and how far off the known walls a point has to be to be one.
@@ -35,10 +37,12 @@ def follow(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
     Raises SimulatorError where an obstacle closes the way, or the robot hits a wall.
     """
     numbers = np.arange(len(way))  # which point of the way that was given each point of the way stands for
+    watch = replace(driver.laser, reach=WATCH)
     at = waited = 0
     while at < len(way) - 1:
-        way, numbers = _around_obstacles(driver, space, way, numbers, at)
-        _stride(driver, way, at)
+        image = watch.scan(driver.world, np.array([driver.robot.pose]), driver.rng)[0]
+        way, numbers = _around_obstacles(driver, space, image, way, numbers, at)
+        _stride(driver, way[at:], AIM if image.min() > WIDE else CLOSE)
         before, at = at, _come_to(way, at, driver)
         waited = 0 if at > before else waited + 1
         if waited > PATIENCE:
@@ -53,11 +57,10 @@ def _come_to(way: Array, at: int, driver: Driver) -> int:
     return len(way) - 1 if at + len(off) == len(way) and off[-1] < 2 * STRIDE else at + nearest
 
 
-def _stride(driver: Driver, way: Array, at: int) -> None:
-    """Turn to the point at which the robot aims, and drive on where it is about ahead."""
+def _stride(driver: Driver, way: Array, aim: float) -> None:
+    """Turn to the point of the way at which the robot aims, and drive on where it is about ahead."""
     x, y, heading = driver.robot.pose
-    ahead = way[at : at + 2 + round(AIM / CELL)]
-    goal = ahead[-1]
+    goal = way[: 2 + round(aim / CELL)][-1]
     turn = math.remainder(math.atan2(goal[1] - y, goal[0] - x) - heading, math.tau)
     if abs(turn) > SHARP:
         driver.go(0.0, math.copysign(min(abs(turn), BEND), turn))
@@ -65,9 +68,9 @@ def _stride(driver: Driver, way: Array, at: int) -> None:
         driver.go(min(STRIDE, max(math.dist(goal, (x, y)), CELL / 2)), math.copysign(min(0.5 * abs(turn), BEND), turn))
 
 
-def _around_obstacles(driver: Driver, space: FreeSpace, way: Array, numbers: Cells, at: int) -> tuple[Array, Cells]:
+def _around_obstacles(driver: Driver, space: FreeSpace, image: Array, way: Array, numbers: Cells, at: int) -> tuple[Array, Cells]:
     """The way, planned anew where the laser shows something new in it."""
-    seen = _obstacles(driver, space)
+    seen = _obstacles(driver, space, image)
     ahead = slice(at, at + round(WATCH / CELL))
     if not len(seen) or not (blocked := np.flatnonzero(_apart(space.middles(way[ahead]), space.middles(seen)) < space.least)).size:
         return way, numbers
@@ -84,10 +87,9 @@ def _around_obstacles(driver: Driver, space: FreeSpace, way: Array, numbers: Cel
     raise _error(driver, "a way around what stands there", "none that is wide enough for the robot")
 
 
-def _obstacles(driver: Driver, space: FreeSpace) -> Array:
+def _obstacles(driver: Driver, space: FreeSpace, image: Array) -> Array:
     """The points where the laser shows something that is neither a known wall nor marked already, (n, 2) metres. They are marked in the space."""
     x, y, heading = driver.robot.pose
-    image = replace(driver.laser, reach=WATCH).scan(driver.world, np.array([driver.robot.pose]), driver.rng)[0]
     near = image < WATCH
     angles = heading + BEARINGS[near]
     points = np.column_stack([x + image[near] * np.cos(angles), y + image[near] * np.sin(angles)])

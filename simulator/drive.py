@@ -134,7 +134,9 @@ class Recorder:
             self._way = self._turned = 0.0
 
     def drive(self, name: str, laser: Laser, odometer: Odometer, seed: int) -> Drive:
-        """The drive that has been noted. The noise of scans and odometer has numbers of its own, so that it does not change where the robot goes."""
+        """The drive that has been noted, with a scan at its end, too. The noise of scans and odometer has numbers of its own, so that it does not change where the robot goes."""
+        if self.scans[-1][1][-1:] != [len(self.poses) - 1]:
+            self.scans[-1][1].append(len(self.poses) - 1)
         sight, wheels = (np.random.default_rng([seed, k]) for k in (2, 3))
         poses = np.array(self.poses)
         numbers = [number for _, part in self.scans for number in part]

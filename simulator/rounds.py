@@ -27,6 +27,7 @@ from simulator.odometer import Odometer
 from simulator.plans import Plan
 from simulator.robot import Body, Robot
 from ssh_abduction.errors import brief, is_finite
+from ssh_abduction.words import counted
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]
@@ -226,7 +227,8 @@ def record_plan(
     for number in range(tours):
         for at in follow(driver, rooms.space, tour.way):
             come += [number * len(tour.way) + at] * (recorder.taken - len(come))
-    drive = recorder.drive(f"{plan.name}, {tours} tours, seed {seed}", laser, odometer or Odometer(), seed)
+    drive = recorder.drive(f"{plan.name}, {counted(tours, 'tours')}, seed {seed}", laser, odometer or Odometer(), seed)
+    come += come[-1:] * (len(drive) - len(come))
     crossings = [(number * len(tour.way) + at, door) for number in range(tours) for at, door in tour.doors]
     return drive.judged(
         {_name(room): middle for room, middle in rooms.middles.items()},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -10,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.control import STILL, Driver, Tolerance, act, climb
+from simulator.cruise import follow
 from simulator.drive import EVERY, Drive, Recorder
 from simulator.errors import SimulatorError
+from simulator.freespace import FreeSpace
 from simulator.junctions import ACTIONS, Pilot
 from simulator.laser import Laser
 from simulator.motion import DIGITS
@@ -22,6 +25,7 @@ from simulator.world import World
 from ssh_abduction.odometry import Covariance, Displacement
 from ssh_abduction.odometry import Odometry as Noise
 from ssh_abduction.trace import Action, Step, Trace
+from ssh_abduction.words import counted
 
 Array = NDArray[np.float64]
 QUARTERS = {"travel": 0, "right": 1, "around": 2, "left": 3}
@@ -79,6 +83,10 @@ def simulate(
     """
     if every is not None and not (math.isfinite(every) and every > 0):
         raise SimulatorError(f"every: expected a number of metres above 0, got {every}; leave it out for images at dstates")
+    if world.by_places:
+        raise SimulatorError(
+            f"{world.name}: route: expected actions, got places, to which a robot drives that logs scans all along; write --as carmen, or give a route of actions"
+        )
     driver = _driver(world, tours, seed, laser, body, tolerance)
     body, tolerance = driver.robot.body, driver.tolerance
     log = Log(driver.robot)
@@ -108,18 +116,33 @@ def record(
     recorder = driver.recorder = Recorder(every)
     recorder.note(driver.world, driver.robot.pose)
     steps = []
-    for _, action in _legs(driver, world, tours):
+    for _, action in _stops(driver, world, tours) if world.by_places else _legs(driver, world, tours):
         steps.append({"scan": recorder.taken - 1, **_truth(world, driver.robot.pose), "action": action})
-    name = f"{world.name}, {tours} tours, seed {seed}"
+    name = f"{world.name}, {counted(tours, 'tours')}, seed {seed}"
     drive = recorder.drive(name, driver.laser, odometer or Odometer(), seed)
-    places = {state.place: state.pose[:2] for state in world.dstates}
-    return drive.judged(places, [_place(world, pose) for pose in drive.poses], steps=steps)
+    return drive.judged(world.places, [_place(world, pose) for pose in drive.poses], steps=steps)
 
 
 def _place(world: World, pose: Array) -> str | None:
     """The place where a robot is: the nearest one, where that is at most `reach` away; None between places."""
-    nearest = min(world.dstates, key=lambda state: math.dist(state.pose[:2], pose[:2]), default=None)
-    return nearest.place if nearest and math.dist(nearest.pose[:2], pose[:2]) <= world.reach else None
+    far = {name: math.dist(at, pose[:2]) for name, at in world.places.items()}
+    nearest = min(far, key=far.__getitem__, default=None)
+    return nearest if nearest is not None and far[nearest] <= world.reach else None
+
+
+def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]:
+    """Drive to the places of the route, tour after tour, off what stands there on that tour. Before each of them its number, and what it is called."""
+    for tour in range(tours):
+        if tour:
+            driver.world = world.arranged(driver.rng)
+        space = FreeSpace.of(world.segments, driver.robot.body.radius)
+        for number, stop in enumerate(world.route, tour * len(world.route)):
+            yield number, stop
+            x, y, _ = driver.robot.pose
+            way = space.part(world.segments.reshape(-1, 2)).way((x, y), world.stops[stop])
+            if way is None:
+                raise SimulatorError(f"{world.name}: route: expected a way from ({x:.2f}, {y:.2f}) to {stop}, got none; open the walls")
+            deque(follow(driver, space, way), maxlen=0)
 
 
 def _driver(world: World, tours: int, seed: int, laser: Laser | None, body: Body | None, tolerance: Tolerance | None) -> Driver:

@@ -27,7 +27,11 @@ from ssh_abduction.files import parse_json, read_at_most
 
 Array = NDArray[np.float64]
 Angles: TypeAlias = Literal["right", "any"]
+Point: TypeAlias = tuple[float, float]
 FORMAT, VERSION = "ssh-world", 1
+ACTIONS = ("travel", "right", "left", "around")
+# Degrees that the straight pieces of an arc are long at most, and metres of those of a ragged wall.
+ARC, RAGGED = 5.0, 0.3
 # Radians that a wall may be off a right angle; and of all walls at most this share may be off by more. So a column, or a corner that is cut off, leaves a world right-angled.
 SQUARE, OBLIQUE = math.radians(5), 0.1
 # The smallest `reach` of a world, in metres: a laser reports no range that is smaller.
@@ -62,10 +66,12 @@ class World:
 
     segments  the walls, (n, 4): x1, y1, x2, y2 in metres
     start     the pose (x, y, heading) in which the robot starts, in metres and radians
-    route     the actions of one tour, which ends where it began
+    route     the actions of one tour, which ends where it began; or the places to which it leads
     reach     the distance at which the robot follows a wall, in metres: half the width of a corridor
     dstates   the truth, for evaluation only
     angles    the angles at which streets meet, which choose the control laws: right, or any
+    places    where places are, in metres, by their names: those of the dstates, or those of a route of places
+    via       points that are no places, through which a route of places may lead
     """
 
     name: str
@@ -76,6 +82,18 @@ class World:
     reach: float = 1.0
     dstates: tuple[TrueDState, ...] = field(default=(), repr=False)
     angles: Angles = "right"
+    places: Mapping[str, Point] = field(default_factory=dict, repr=False)
+    via: Mapping[str, Point] = field(default_factory=dict, repr=False)
+
+    @property
+    def by_places(self) -> bool:
+        """Whether the route is one of places."""
+        return bool(self.route) and not set(self.route) <= set(ACTIONS)
+
+    @property
+    def stops(self) -> dict[str, Point]:
+        """All that a route of places may lead to."""
+        return {**self.via, **self.places}
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -129,7 +147,7 @@ class World:
         if route is not None:
             if not isinstance(route, str):
                 raise reader.wrong("route", "actions with commas between", route)
-            world = replace(world, route=reader.route(route.split(",")))
+            world = replace(world, route=reader.route(route.split(","), world.stops))
         return world if reach is None else replace(world, reach=reader.reach(reach))
 
     @classmethod
@@ -184,18 +202,29 @@ class _Reader:
             raise self.wrong("format", f'an object with "format": "{FORMAT}", "version": {VERSION}', data)
         walls = [self.loop(p, f"polygons[{i}]") for i, p in enumerate(self.list(data, "polygons"))]
         walls += [self.numbers(s, 4, f"segments[{i}]").reshape(1, 4) for i, s in enumerate(self.list(data, "segments"))]
+        walls += [self.arc(a, f"arcs[{i}]") for i, a in enumerate(self.list(data, "arcs"))]
+        if "occupancy" in data:
+            walls.append(self.occupancy(data["occupancy"]))
         if not walls:
-            raise self.wrong("polygons", "at least one wall in polygons or segments", [])
+            raise self.wrong("polygons", "at least one wall in polygons, segments, arcs or occupancy", [])
         segments = np.vstack(walls)
+        dstates = tuple(self.dstate(s, f"dstates[{i}]") for i, s in enumerate(self.list(data, "dstates")))
+        places = {state.place: state.pose[:2] for state in dstates} | self.points(data.get("places", {}), "places")
+        via = self.points(data.get("via", {}), "via")
+        stops = {**via, **places}
+        route = self.route(self.list(data, "route"), stops)
+        start = [*stops[route[0]], 0.0] if set(route) & set(stops) else [0, 0, 0]
         return World(
             name=self.name(data.get("name", printable(Path(self.where).stem))),
-            segments=segments,
+            segments=self.ragged(segments, data.get("ragged", 0.0)),
             angles=self.angles(data.get("angles"), segments),
             clutter=tuple(self.clutter(c, f"clutter[{i}]") for i, c in enumerate(self.list(data, "clutter"))),
-            start=self.pose(data.get("start", [0, 0, 0]), "start"),
-            route=self.route(self.list(data, "route")),
+            start=self.pose(data.get("start", start), "start"),
+            route=route,
             reach=self.reach(data.get("reach", 1.0)),
-            dstates=tuple(self.dstate(s, f"dstates[{i}]") for i, s in enumerate(self.list(data, "dstates"))),
+            dstates=dstates,
+            places=places,
+            via=via,
         )
 
     def name(self, value: Any) -> str:
@@ -225,10 +254,51 @@ class _Reader:
         points = np.array([self.numbers(p, 2, f"{name}[{i}]") for i, p in enumerate(value)])
         return np.hstack([points, np.roll(points, -1, axis=0)])
 
-    def route(self, value: Sequence[Any]) -> tuple[str, ...]:
-        for i, action in enumerate(value):
-            if action not in ("travel", "right", "left", "around"):
-                raise self.wrong(f"route[{i}]", "travel, right, left or around", action)
+    def arc(self, value: Any, name: str) -> Array:
+        """An arc as segments: x and y of its centre, its radius, and between which directions it is, counter-clockwise, in degrees."""
+        x, y, radius, first, last = self.numbers(value, 5, name)
+        if not radius > 0 or not 0 < last - first <= 360:
+            raise self.wrong(name, "[x, y, radius above 0, from, to], where `to` is up to 360 degrees above `from`", value)
+        angles = np.radians(np.linspace(first, last, 1 + math.ceil((last - first) / ARC)))
+        points = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
+        return np.hstack([points[:-1], points[1:]])
+
+    def occupancy(self, value: Any) -> Array:
+        """The walls of an occupancy map, whose YAML file is named against the folder of the world."""
+        if not isinstance(value, str):
+            raise self.wrong("occupancy", "the name of a YAML file", value)
+        return read_occupancy(Path(self.where).parent / value)[1]
+
+    def ragged(self, walls: Array, value: Any) -> Array:
+        """The walls in pieces, whose ends are off by so many metres (a standard deviation): always the same, so that a world looks the same on each drive."""
+        if not is_finite(value) or not 0 <= value <= 1:
+            raise self.wrong("ragged", "metres by which walls are uneven, 0 to 1", value)
+        if not value:
+            return walls
+        pieces = []
+        for x1, y1, x2, y2 in walls:
+            line = np.linspace((x1, y1), (x2, y2), 1 + math.ceil(math.hypot(x2 - x1, y2 - y1) / RAGGED))
+            pieces.append(np.hstack([line[:-1], line[1:]]))
+        ends, which = np.unique(np.vstack(pieces).reshape(-1, 2).round(6), axis=0, return_inverse=True)  # walls that meet still do
+        moved: Array = (ends + np.random.default_rng(0).normal(0, value, ends.shape))[which.ravel()].reshape(-1, 4)
+        return moved
+
+    def points(self, value: Any, name: str) -> dict[str, Point]:
+        if not isinstance(value, Mapping):
+            raise self.wrong(name, "an object of names and points [x, y]", value)
+        if clash := next((text for text in value if text in ACTIONS or "," in text), None):
+            raise self.wrong(name, "names without commas that are no actions", clash)
+        found = {text: self.numbers(point, 2, f"{name}.{text}").tolist() for text, point in value.items()}
+        return {text: (x, y) for text, (x, y) in found.items()}
+
+    def route(self, value: Sequence[Any], stops: Mapping[str, Point]) -> tuple[str, ...]:
+        """Actions, or the names of places."""
+        by_places = any(isinstance(stop, str) and stop in stops for stop in value)
+        for i, stop in enumerate(value):
+            if by_places and not (isinstance(stop, str) and stop in stops):
+                raise self.wrong(f"route[{i}]", f"a place ({', '.join(stops)}), as there are others in the route", stop)
+            if not by_places and stop not in ACTIONS:
+                raise self.wrong(f"route[{i}]", "travel, right, left or around" + (", or the name of a place" if stops else ""), stop)
         return tuple(value)
 
     def reach(self, value: Any) -> float:

@@ -446,7 +446,10 @@ def test_errors_of_the_wings_are_one_line(tmp_path: Path, capsys: pytest.Capture
     (tmp_path / "cut.skops").write_bytes(b"PK\x03\x04")
     (tmp_path / "maps.json").write_text(json.dumps(solve(Trace.from_steps("a", [])).maps[0].to_dict()))
     for words, message in [
-        (["simulate", "atlantis", "-o", str(tmp_path / "x")], "world: expected one of five-ways, notched-rectangle, six-ways, taylor-hall"),
+        (
+            ["simulate", "atlantis", "-o", str(tmp_path / "x")],
+            "world: expected one of cluttered, curved, doors, five-ways, notched-rectangle, six-ways, taylor-hall",
+        ),
         (["simulate", "notched-rectangle", "--tours", "0", "-o", str(tmp_path / "x")], "tours: expected 1 or more"),
         (["simulate", "notched-rectangle", "--route", "travel,travel", "-o", str(tmp_path / "x")], "expected a free way ahead, got a wall"),
         (["cluster", str(trace), "-o", str(tmp_path / "x")], "image: expected one, got none"),

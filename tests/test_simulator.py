@@ -188,7 +188,8 @@ def test_bad_worlds_name_the_field(changes: dict[str, Any], message: str, tmp_pa
 
 def test_worlds_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(
-        SimulatorError, match="expected one of five-ways, notched-rectangle, six-ways, taylor-hall, three-ways, triangle, or a file"
+        SimulatorError,
+        match="expected one of cluttered, curved, doors, five-ways, notched-rectangle, six-ways, taylor-hall, three-ways, triangle, or a file",
     ):
         World.named("atlantis")
     with pytest.raises(SimulatorError, match="check the path"):

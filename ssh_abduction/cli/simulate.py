@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ssh_abduction.trace import Trace
 
 ENDINGS = (".log", ".clf", ".bag", ".mcap")
-SHIPPED = ("notched-rectangle", "taylor-hall", "triangle", "three-ways", "five-ways", "six-ways")
+SHIPPED = ("notched-rectangle", "taylor-hall", "triangle", "three-ways", "five-ways", "six-ways", "curved", "cluttered", "doors")
 
 
 def add_parser(verbs: Verbs) -> None:
