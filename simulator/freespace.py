@@ -41,7 +41,7 @@ class FreeSpace:
 
     corner    x and y of the lower left corner, metres
     occupied  (rows, columns)
-    radius    of the robot, metres: the middle of the robot stays so far off, and a cell and a half more
+    radius    of the robot, metres: the middle of the robot stays so far off, and a cell more
     off       (rows, columns): metres to the nearest wall, obstacles not counted
     """
 
@@ -65,7 +65,7 @@ class FreeSpace:
     @property
     def least(self) -> float:
         """Metres that the middle of the robot stays off what is occupied."""
-        return self.radius + 1.5 * CELL
+        return self.radius + CELL
 
     def drawn(self, segments: Array) -> Mask:
         """The cells that segments go through."""
