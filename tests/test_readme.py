@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+import figures
 import pytest
 
 from ssh_abduction.cli import main, parser
@@ -155,6 +156,11 @@ def test_the_trace_of_the_formats_page_has_a_map(tmp_path: Path) -> None:
 def test_the_picture_is_the_map() -> None:
     (ssh_map,) = solve(Trace.load(ROOT / "examples" / "notched-rectangle.jsonl")).maps
     assert (ROOT / "docs" / "notched-rectangle.svg").read_text() == svg(ssh_map) + "\n"
+
+
+@pytest.mark.parametrize("name", figures.DRAWN)
+def test_the_figures_are_what_the_program_draws(name: str) -> None:
+    assert (figures.FIGURES / f"{name}.svg").read_text() == figures.DRAWN[name]() + "\n"
 
 
 def test_the_readme_is_short_and_its_links_are_whole() -> None:
