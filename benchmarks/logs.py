@@ -29,12 +29,12 @@ from ssh_abduction.maps import maps_of, read_json
 
 METHODS = ("ssh-abduction", "skeleton, corrected poses", "skeleton, odometry")
 HEAD = (
-    "| log | mapper | places | events | events: precision, recall | accuracy | edges: precision, recall | pairs: joined, returns | pairs: precision, recall | CPU s |",
-    "|---|---|---|---|---|---|---|---|---|---|",
+    "| log | mapper | places | events | events: precision, recall | passes noticed | accuracy | edges: precision, recall | pairs: joined, returns | pairs: precision, recall | CPU s |",
+    "|---|---|---|---|---|---|---|---|---|---|---|",
 )
 SIMULATED = (
-    "| mapper | logs | mapped | isomorphic | places right | stays in rooms noticed | places, median | accuracy, median | edges: precision, recall, medians | pairs: precision, recall, of all logs |",
-    "|---|---|---|---|---|---|---|---|---|---|",
+    "| mapper | logs | mapped | isomorphic | places right | stays in rooms noticed | passes noticed | places, median | accuracy, median | edges: precision, recall, medians | pairs: precision, recall, of all logs |",
+    "|---|---|---|---|---|---|---|---|---|---|---|",
 )
 
 
@@ -96,39 +96,42 @@ def shown(*values: float | None) -> str:
 def lines_of(row: dict[str, Any]) -> Iterator[str]:
     """A row of the table of real logs, and one more for pairs by relations."""
     if "failed" in row:
-        yield f"| {row['log']} | {row['method']} | {row['failed']} | | | | | | | |"
+        yield f"| {row['log']} | {row['method']} | {row['failed']} | | | | | | | | |"
         return
-    pairs = row["poses"]
+    pairs, (come, noticed) = row["poses"], row["passes"]
     cells = [
         row["log"],
         row["method"],
         row["nodes"],
         row["events"],
         shown(row["event_precision"], row["event_recall"]),
-        shown(row["accuracy"]),
+        f"{noticed} of {come}",
     ]
-    cells += [
-        shown(row["edge_precision"], row["edge_recall"]),
-        f"{pairs['joined']}, {pairs['returns']}",
-        shown(pairs["precision"], pairs["recall"]),
-    ]
-    yield "| " + " | ".join(map(str, [*cells, "–" if row["method"] == METHODS[0] else f"{row['seconds']:.1f}"])) + " |"
+    cells += [shown(row["accuracy"]), shown(row["edge_precision"], row["edge_recall"]), f"{pairs['joined']}, {pairs['returns']}"]
+    cells += [shown(pairs["precision"], pairs["recall"]), "–" if row["method"] == METHODS[0] else f"{row['seconds']:.1f}"]
+    yield "| " + " | ".join(map(str, cells)) + " |"
     if (pairs := row.get("relations")) is not None:
-        yield f"| by relations | {row['method']} | | | | | | {pairs['joined']}, {pairs['returns']} | {shown(pairs['precision'], pairs['recall'])} | |"
+        yield f"| by relations | {row['method']} | | | | | | | {pairs['joined']}, {pairs['returns']} | {shown(pairs['precision'], pairs['recall'])} | |"
 
 
 def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
     """What came of all simulated logs by one method."""
     done = [row for row in rows if "failed" not in row]
     if not done:
-        return f"| {method} | {len(rows)} | 0 | 0 | 0 | | | | | |"
+        return f"| {method} | {len(rows)} | 0 | 0 | 0 | | | | | | |"
 
     def median(name: str) -> float | None:
         return statistics.median([row[name] for row in done if row[name] is not None] or [0])
 
     joined, right, returns = (sum(row["poses"][name] for row in done) for name in ("joined", "right", "returns"))
+    come, noticed = (sum(row["passes"][k] for row in done) for k in (0, 1))
     cells = [method, len(rows), len(done), sum(row["isomorphic"] for row in done), sum(row["places_right"] for row in done)]
-    cells += [shown(statistics.mean(row["event_recall"] for row in done)), median("nodes"), shown(median("accuracy"))]
+    cells += [
+        shown(statistics.mean(row["event_recall"] for row in done)),
+        f"{noticed} of {come}",
+        median("nodes"),
+        shown(median("accuracy")),
+    ]
     cells += [
         shown(median("edge_precision"), median("edge_recall")),
         shown(right / joined if joined else None, right / returns if returns else None),

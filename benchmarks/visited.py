@@ -19,11 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.ndimage import label
 from skeleton import poses_of
 
 from perception.readers.logs import read_log
 from ssh_abduction import Action, DState, SSHMap, Step, Trace
 from ssh_abduction.evaluation import Evaluation, Relations, VisitsEvaluation, evaluate, evaluate_visits, told_poses
+from ssh_abduction.evaluation.visits import NEAR
 
 Array = NDArray[np.float64]
 # A robot visits a place when it comes so near to it, in metres. In ACES3, anything from 1.5 to 6 m makes the same 15 visits.
@@ -150,12 +152,29 @@ class Events:
         )
 
 
+def passes(events: Events, truth: Truth) -> tuple[int, int]:
+    """How often the robot came back to where it had an event, or would have one, and how often it had an event there then.
+
+    It comes back if it is within NEAR of the event after it was farther than twice that. An event is there if it is at a scan within twice NEAR.
+    """
+    where = truth.poses[list(events.scans)] if events.poses is None else events.poses
+    come = noticed = 0
+    for (x, y, _), scan in zip(where, events.scans, strict=True):
+        distance = np.hypot(*(truth.poses[:, :2] - (x, y)).T)
+        parts, _ = label(distance <= 2 * NEAR)
+        for part in set(parts[distance <= NEAR].tolist()) - {parts[scan], 0}:
+            come += 1
+            noticed += any(parts[other] == part for other in events.scans)
+    return come, noticed
+
+
 @dataclass(frozen=True)
 class Figures:
     """How right a mapper is.
 
     nodes      how many places it has, of those that were visited
     precision, recall  of events: of its events, the share that is a true visit; of the true visits, or else of the stays in rooms, the share that has an event. None where these are not known
+    passes     how often the robot came back to where an event is, and how often there is an event then
     named      accuracy, edges and pairs by the names of the true places, in the terms of `evaluate`
     posed      pairs of events by poses, in the terms of `evaluate`
     related    the same by hand-checked relations, where there are any
@@ -165,6 +184,7 @@ class Figures:
     events: int
     precision: float | None
     recall: float | None
+    passes: tuple[int, int]
     named: Evaluation
     posed: VisitsEvaluation
     related: VisitsEvaluation | None
@@ -178,7 +198,13 @@ class Figures:
         """The figures under short names, None where they cannot be said."""
         named, row = (
             self.named.maps[0],
-            {"nodes": self.nodes, "events": self.events, "event_precision": self.precision, "event_recall": self.recall},
+            {
+                "nodes": self.nodes,
+                "events": self.events,
+                "event_precision": self.precision,
+                "event_recall": self.recall,
+                "passes": self.passes,
+            },
         )
         row |= {
             "places_right": named.places_right,
@@ -217,6 +243,7 @@ def judged(events: Events, truth: Truth) -> Figures:
         events=len(names),
         precision=hits / len(names) if truth.visits else None,
         recall=hits / len(truth.visits) if truth.visits else noticed / len(truth.stays) if truth.stays else None,
+        passes=passes(events, truth),
         named=evaluate([ssh_map], trace),
         posed=evaluate_visits([ssh_map], trace),
         related=truth.relations and evaluate_visits([ssh_map], trace, relations=truth.relations),

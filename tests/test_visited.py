@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from skeleton import CELL, _chains, _pixels, _prune, poses_of, skeleton_of
-from visited import ACES_COLUMNS, ACES_NAMES, ACES_ROUTE, ACES_ROWS, Events, Truth, Visit, judged, truth_of, visits_of, with_names
+from visited import ACES_COLUMNS, ACES_NAMES, ACES_ROUTE, ACES_ROWS, Events, Truth, Visit, judged, passes, truth_of, visits_of, with_names
 
 from perception.readers.scans import Laser, RobotLog, Scan
 from simulator.laser import BEAMS, BEARINGS, meetings
@@ -75,6 +75,13 @@ def test_events_are_matched_to_visits_one_by_one() -> None:
     assert (figures.nodes, figures.precision, figures.recall, figures.isomorphic) == (3, 1 / 2, 1, False)
     assert judged(Events((5, 18), ("a", "b")), truth).isomorphic
     assert not judged(Events((5, 18), ("a", "a")), truth).isomorphic
+
+
+def test_passes_without_an_event_are_noticed() -> None:
+    way = [*range(0, 11), *range(10, -1, -1), *range(0, 11)]
+    truth = Truth(np.array([(float(x), 0.0, 0.0) for x in way]))
+    # To 5 m it came back twice, and has an event one of these times, as seen from either event there; to 10 m it came back once, without one.
+    assert passes(Events((5, 10, 27), ("a", "b", "a")), truth) == (5, 2)
 
 
 def test_events_in_buildings_are_at_doors_or_in_rooms(tmp_path: Path) -> None:
