@@ -10,17 +10,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from itertools import chain, product
+from itertools import chain, pairwise, product
 from pathlib import Path
 from time import process_time
 from typing import Any
 
+import numpy as np
 from pages import print_rows
-from skeleton import poses_of, skeleton_of
+from skeleton import lay, poses_of, skeleton_of
 from visited import Events, Truth, judged, truth_of
 
 from perception.readers.logs import read_log
@@ -139,6 +141,47 @@ def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
     return "| " + " | ".join(map(str, cells)) + " |"
 
 
+def draw(path: Path, logs: Sequence[Path], runs: Path) -> None:
+    """Draw for each log the grid at the corrected poses with its skeleton (blue squares), and upon it the first map (orange): events, and the places that they are at."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, panels = plt.subplots(2, math.ceil(len(logs) / 2), figsize=(5.5 * math.ceil(len(logs) / 2), 11), squeeze=False)
+    for axes in panels.flat:
+        axes.axis("off")
+    for axes, log in zip(panels.flat, logs, strict=False):
+        read = read_log(str(log))
+        poses = poses_of(read, "corrected")
+        lay(axes, skeleton_of(read, poses), poses)
+        axes.set_title(name_of(log))
+        try:
+            events = by_map(log, runs)
+        except (OSError, ValueError, subprocess.CalledProcessError) as error:
+            print(f"{name_of(log)}: {error}", file=sys.stderr)
+            continue
+        at = np.array([poses[scan] for scan in events.scans] if events.poses is None else events.poses)[:, :2]
+        middle = {place: at[[i for i, other in enumerate(events.places) if other == place]].mean(axis=0) for place in events.places}
+        for here, there in pairwise(events.places):
+            axes.plot(*np.array([middle[here], middle[there]]).T, color="tab:orange", linewidth=1.5)
+        for place, (x, y) in zip(events.places, at, strict=True):
+            axes.plot([x, middle[place][0]], [y, middle[place][1]], color="tab:red", linewidth=1)
+            axes.plot(x, y, ".", color="tab:red", markersize=4)
+        for number, (x, y) in enumerate(middle.values()):
+            axes.annotate(
+                str(number),
+                (x, y),
+                fontsize=8,
+                ha="center",
+                va="center",
+                bbox={"boxstyle": "circle,pad=0.2", "fc": "tab:orange", "ec": "none"},
+            )
+    figure.tight_layout()
+    figure.savefig(path, dpi=60)
+    plt.close(figure)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("logs", nargs="*", type=Path, metavar="LOG")
@@ -153,6 +196,7 @@ def main() -> None:
         help="where map writes a folder for each log, or has written it (default: runs)",
     )
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS, help="which mappers (default: all)")
+    parser.add_argument("--figure", type=Path, help="draw the logs that are given, their skeletons and maps, into this file")
     parser.add_argument("--page", type=Path, help="write the tables into this page, too")
     options = parser.parse_args()
     rows = [json.loads(line) for line in options.out.read_text().splitlines()] if options.out.exists() else []
@@ -165,6 +209,8 @@ def main() -> None:
             rows.append(row_of(log, method, truth, options.runs))
             with options.out.open("a") as file:
                 print(json.dumps(rows[-1]), file=file)
+    if options.figure:
+        draw(options.figure, options.logs, options.runs)
     real = sorted((row for row in rows if not row["simulated"]), key=lambda row: (row["log"], METHODS.index(row["method"])))
     print_rows([*HEAD, *(line for row in real for line in lines_of(row))], options.page, r"\| log \| mapper")
     simulated = [row for row in rows if row["simulated"]]

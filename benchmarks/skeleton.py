@@ -250,28 +250,35 @@ def _merged(graph: nx.MultiGraph) -> nx.MultiGraph:
     return merged
 
 
+def lay(axes: Any, skeleton: Skeleton, poses: Sequence[Pose]) -> None:
+    """Draw the grid, the way of the robot and the graph; nodes that it passed are filled."""
+    grid = skeleton.grid
+    rows, columns = grid.cells.shape
+    shown = np.where(np.isnan(grid.cells), 0.8, np.where(skeleton.free, 1.0, np.where(grid.cells == 1.0, 0.94, 0.0)))
+    x, y = grid.origin
+    axes.imshow(shown, cmap="gray", vmin=0, vmax=1, origin="lower", extent=(x, x + columns * CELL, y, y + rows * CELL))
+    axes.plot(*np.array(poses)[:, :2].T, color="0.45", linewidth=0.8)
+    for *_, data in skeleton.graph.edges(data=True):
+        axes.plot(*data["way"].T, color="tab:blue", linewidth=1)
+    passed = {node for _, node in skeleton.events(poses)}
+    for node, data in skeleton.graph.nodes(data=True):
+        axes.plot(*data["at"], "s", color="tab:blue", markerfacecolor="tab:blue" if node in passed else "white", markersize=4)
+    axes.set_aspect("equal")
+
+
 def draw(path: Path, skeleton: Skeleton, poses: Sequence[Pose], title: str) -> None:
-    """Draw the grid, the graph with its nodes by number, and the way of the robot."""
+    """Draw the grid, the way of the robot and the graph, with its nodes by number."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    grid = skeleton.grid
-    rows, columns = grid.cells.shape
+    rows, columns = skeleton.grid.cells.shape
     figure, axes = plt.subplots(figsize=(14, 14 * max(0.4, min(1.4, rows / columns))))
-    shown = np.where(np.isnan(grid.cells), 0.75, np.where(skeleton.free, 1.0, np.where(grid.cells == 1.0, 0.93, 0.0)))
-    x, y = grid.origin
-    axes.imshow(shown, cmap="gray", vmin=0, vmax=1, origin="lower", extent=(x, x + columns * CELL, y, y + rows * CELL))
-    axes.plot(*np.array(poses)[:, :2].T, color="tab:orange", linewidth=1, label="way of the robot")
-    for *_, data in skeleton.graph.edges(data=True):
-        axes.plot(*data["way"].T, color="tab:blue", linewidth=1.5)
-    passed = {node for _, node in skeleton.events(poses)}
+    lay(axes, skeleton, poses)
     for node, data in skeleton.graph.nodes(data=True):
-        axes.plot(*data["at"], "o", color="tab:red" if node in passed else "tab:cyan", markersize=5)
         axes.annotate(str(node), data["at"], fontsize=7, xytext=(3, 3), textcoords="offset points")
     axes.set_title(title)
-    axes.set_aspect("equal")
     figure.savefig(path, dpi=80, bbox_inches="tight")
     plt.close(figure)
 
