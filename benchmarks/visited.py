@@ -34,6 +34,8 @@ REACH = 3.0
 DOOR = 1.0
 # Events at no known place are at one place if they are on the average within this, in metres.
 APART = 2.0
+# A robot has left a place when it is so far from it, in metres: where it swerves in a rotunda it has not.
+AWAY = 5.0
 # ACES3: three corridors along x, and three along y, in metres of the corrected poses. Each crossing is a place.
 ACES_COLUMNS, ACES_ROWS = (-20.0, -1.0, 22.5), (-0.5, -19.0, -39.0)
 ACES_NAMES = ("NW", "N", "NE"), ("W", "C", "E"), ("SW", "S", "SE")
@@ -155,13 +157,13 @@ class Events:
 def passes(events: Events, truth: Truth) -> tuple[int, int]:
     """How often the robot came back to where it had an event, or would have one, and how often it had an event there then.
 
-    It comes back if it is within NEAR of the event after it was farther than twice that. An event is there if it is at a scan within twice NEAR.
+    It comes back if it is within NEAR of the event after it was farther than AWAY. An event is there if it is at a scan since then.
     """
     where = truth.poses[list(events.scans)] if events.poses is None else events.poses
     come = noticed = 0
     for (x, y, _), scan in zip(where, events.scans, strict=True):
         distance = np.hypot(*(truth.poses[:, :2] - (x, y)).T)
-        parts, _ = label(distance <= 2 * NEAR)
+        parts, _ = label(distance <= AWAY)
         for part in set(parts[distance <= NEAR].tolist()) - {parts[scan], 0}:
             come += 1
             noticed += any(parts[other] == part for other in events.scans)
@@ -286,12 +288,15 @@ def main() -> None:
         print(
             f"scan {scan:4}  ({x:6.1f}, {y:6.1f}, {math.degrees(heading):4.0f})  {name}{'' if visit is not None or not truth.visits else '  no visit'}"
         )
-    missed = [visit.place for number, visit in enumerate(truth.visits) if number not in matched]
+    figures = judged(events, truth)
     if truth.visits:
-        hits = len(truth.visits) - len(missed)
+        missed = [visit.place for number, visit in enumerate(truth.visits) if number not in matched]
         print(
-            f"{len(matched)} events, precision {hits / len(matched):.2f}, recall {hits / len(truth.visits):.2f}; missed: {' '.join(missed) or 'none'}"
+            f"{len(matched)} events, precision {figures.precision:.2f}, recall {figures.recall:.2f}; missed: {' '.join(missed) or 'none'}"
         )
+    if truth.stays:
+        print(f"{len(matched)} events; an event or more in {figures.recall:.0%} of {len(truth.stays)} stays in rooms")
+    print("came back {} times to where an event is, and noticed it {} times".format(*figures.passes))
     if options.output:
         with_names(trace, truth).save(options.output)
 

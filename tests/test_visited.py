@@ -78,10 +78,10 @@ def test_events_are_matched_to_visits_one_by_one() -> None:
 
 
 def test_passes_without_an_event_are_noticed() -> None:
-    way = [*range(0, 11), *range(10, -1, -1), *range(0, 11)]
+    way = [*range(14), *range(13, -1, -1), *range(14)]
     truth = Truth(np.array([(float(x), 0.0, 0.0) for x in way]))
-    # To 5 m it came back twice, and has an event one of these times, as seen from either event there; to 10 m it came back once, without one.
-    assert passes(Events((5, 10, 27), ("a", "b", "a")), truth) == (5, 2)
+    # To 6 m it came back twice, and has an event one of these times, as seen from either event there; to 13 m it came back once, without one.
+    assert passes(Events((6, 13, 34), ("a", "b", "a")), truth) == (5, 2)
 
 
 def test_events_in_buildings_are_at_doors_or_in_rooms(tmp_path: Path) -> None:
