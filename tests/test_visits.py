@@ -150,6 +150,27 @@ def test_relations_judge_where_poses_are_missing(tmp_path: Path, capsys: pytest.
     assert row.split()[:6] == ["1", "2", "4", "1", "0.250", "0.333"]
 
 
+def test_relations_of_another_log_are_noticed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    poses, related = circle(2)
+    times = [0, 60, 120, 180, 240]
+    relations = Relations(related)
+    own = posed([list(poses[t]) for t in times], ["travel"] * 4, times)
+    assert evaluate_visits([], own, relations=relations).by_both == (10, 10)
+    other = posed([[9 * t, 0, 0] for t in times], ["travel"] * 4, times)
+    assert evaluate_visits([], other, relations=relations).by_both == (10, 6)
+    other.save(tmp_path / "trace.jsonl")
+    labelled(range(5), range(5)).save(tmp_path / "map.json")
+    (tmp_path / "relations").write_text(
+        "".join(f"{r.first} {r.second} {' '.join(map(str, r.displacement[:2]))} 0 0 0 {r.displacement[2]}\n" for r in related)
+    )
+    assert (
+        main(["evaluate", *(str(tmp_path / name) for name in ("map.json", "trace.jsonl")), "--relations", str(tmp_path / "relations")]) == 0
+    )
+    said = capsys.readouterr()
+    assert "relations and the poses of the trace judge 6 of 10 pairs of visits alike: are " in said.err
+    assert "poses judge 6 of 10 pairs of visits alike" in said.out
+
+
 def test_names_and_poses_are_judged_where_both_are_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trace = posed([[0, 0, 0], [9, 0, 0], [1, 0, 0]], ["travel", "travel"])
     trace = replace(trace, steps=tuple(replace(step, truth={**step.truth, "place": "ABA"[t]}) for t, step in enumerate(trace.steps)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.options import Verbs, read_maps
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, MapPairs, VisitsEvaluation
 
 UNKNOWN = "–"
+# Poses and relations of one log judge at least such a share of the pairs alike: else they are of different logs, or one of them is wrong.
+ALIKE = 0.9
 PAIRS = ("map", "places", "joined", "right", "precision", "recall", "dstates", "joined", "right", "precision", "recall")
 HEAD = ("map", "isomorphic", "dstates", "places", "paths", "accuracy", "same place", "edges", "links")
 
@@ -61,6 +64,13 @@ def run(options: argparse.Namespace) -> int:
             found = evaluate(maps, trace)
     except MapError as error:
         raise MapError(f"{named(options.maps)}: {error}") from None
+    for visits in judged:
+        if visits.by_both is not None and visits.by_both[1] < ALIKE * visits.by_both[0]:
+            print(
+                f"ssh-abduction: warning: relations and the poses of the trace judge {visits.by_both[1]} of {counted(visits.by_both[0], 'pairs')} of visits alike: "
+                f"are {named(options.relations)} relations of this log?",
+                file=sys.stderr,
+            )
     if options.json:
         told = {"count": len(maps)} if found is None else found.to_dict()
         print(json_line({**told, **{visits.judge: visits.to_dict() for visits in judged}}))
@@ -87,6 +97,7 @@ def _told_of_visits(found: VisitsEvaluation) -> str:
         f"{found.near:g} m, and the robot was farther away in between; of {counted(dstates.judged, 'pairs')} of their steps {dstates.returns} are returns "
         f"to one dstate: headings differ by at most {found.turned:g} degrees, too"
         + "".join(f"\nleft out: {text}" for text in left_out if text)
+        + (f"\nposes judge {found.by_both[1]} of {counted(found.by_both[0], 'pairs')} of visits alike" if found.by_both else "")
     )
 
 

@@ -49,6 +49,7 @@ Steps: TypeAlias = NDArray[np.int_]
 Verdicts: TypeAlias = NDArray[np.uint8]
 # What is true of a pair: nobody knows; it is not one; it is one; or it is near, but the robot was not away in between.
 UNKNOWN, APART, RETURN, STAYED = range(4)
+JUDGED = APART, RETURN
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +116,7 @@ class VisitsEvaluation:
     visits   how many the trace has
     places, dstates  the pairs of visits, and of steps of different visits
     maps     each map, in the order given
+    by_both  of the pairs of visits that relations judge, how many the poses of the trace judge, too, and how many of these they judge alike; None where poses judge
     """
 
     judge: str
@@ -124,6 +126,7 @@ class VisitsEvaluation:
     places: Pairs
     dstates: Pairs
     maps: tuple[MapVisits, ...]
+    by_both: tuple[int, int] | None = None
 
     def __repr__(self) -> str:
         told = f"{counted(self.visits, 'visits')}, {counted(self.places.returns, 'returns')} by {self.judge}"
@@ -131,7 +134,7 @@ class VisitsEvaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """The values under their names, as `evaluate --json` prints them, with the precision and recall of each map."""
-        own = {
+        own: dict[str, Any] = {
             "near": self.near,
             "turned": self.turned,
             "visits": self.visits,
@@ -139,6 +142,8 @@ class VisitsEvaluation:
             "dstates": asdict(self.dstates),
         }
         maps = [{"places": found.places and found.places.to_dict(), "dstates": found.dstates.to_dict()} for found in self.maps]
+        if self.by_both is not None:
+            own |= {"by_both": self.by_both[0], "alike": self.by_both[1]}
         return {**own, "maps": maps}
 
 
@@ -161,6 +166,11 @@ def evaluate_visits(
     truth: _Poses | _Related = _Poses(trace) if relations is None else _Related(trace, relations)
     visit = np.cumsum([0, *(action.kind != "turn" for action in trace.actions)])
     places, dstates = _verdicts(truth, visit, near, turned)
+    by_both = None
+    if relations is not None and any(told_poses(trace)):
+        other, _ = _verdicts(_Poses(trace), visit, near, turned)
+        judged = np.isin(places, JUDGED) & np.isin(other, JUDGED)
+        by_both = int(judged.sum()), int((judged & (places == other)).sum())
     return VisitsEvaluation(
         judge=truth.name,
         near=float(near),
@@ -169,6 +179,7 @@ def evaluate_visits(
         places=_pairs(places, np.arange(len(places))),
         dstates=_pairs(dstates, visit),
         maps=tuple(_evaluated(checked_map(ssh_map, f"maps[{i}]", trace), visit, places, dstates) for i, ssh_map in enumerate(maps)),
+        by_both=by_both,
     )
 
 
