@@ -4,7 +4,7 @@
 
 draws for each log the grid, the graph and the way of the robot. All scans are laid into the grid at their poses: at the corrected ones, which the robot did not have, or at those of the odometry. The skeleton (Zhang & Suen 1984,
 scikit-image) of the cells where a robot fits has branches to every niche; one that ends within the circle around its junction that touches the nearest wall, or hardly beyond it, is cut off, as is usual (Thrun 1998, "Learning metric-topological maps";
-Shaked & Bruckstein 1998, "Pruning medial axes"). Junctions in one open space, nearer to each other than to the walls, are one node. Nodes are junctions and dead ends. All lengths are in metres, and the same for all logs.
+Shaked & Bruckstein 1998, "Pruning medial axes"). Junctions in one open space, nearer to each other than to the walls, are one node. Nodes are junctions, dead ends and doors. All lengths are in metres, and the same for all logs.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ LEAST = 2  # So many beams have to have passed a cell that is free.
 RADIUS = 0.25  # of the robot
 SPECK = 0.3  # square metres: smaller obstacles, and smaller holes in what was seen, are noise
 SPUR = 1.0  # A branch that ends is kept where it is so much longer than the distance of its junction from the walls.
+DOOR = 0.75  # A door is where the walls are nearer than this on both sides, and nowhere nearer within 2 m along the way,
+WIDER = 1.4  # and so many times farther within 2 m both ways.
 REACH = 1.5  # The robot passes a node within this, or within the node's distance from the walls.
 
 
@@ -153,7 +155,7 @@ def skeleton_of(log: RobotLog, poses: Sequence[Pose]) -> Skeleton:
     for node, data in graph.nodes(data=True):
         data["clear"] = float(clear[node])
     _prune(graph)
-    graph = _merged(graph)
+    graph = _with_doors(_merged(graph), clear)
     for _, data in graph.nodes(data=True):
         data["at"] = grid.points(np.array([data["cell"]]))[0]
     for *_, data in graph.edges(data=True):
@@ -248,6 +250,26 @@ def _merged(graph: nx.MultiGraph) -> nx.MultiGraph:
             cells = data["cells"] if data["cells"][0] == a else data["cells"][::-1]
             _join(merged, [home[a], *cells, home[b]])
     return merged
+
+
+def _with_doors(graph: nx.MultiGraph, clear: Array) -> nx.MultiGraph:
+    """The graph with a node at each door: a place along an edge that is the narrowest one far and wide, as critical points of Voronoi graphs are."""
+    within = round(2.0 / CELL)
+    opened = nx.MultiGraph()
+    opened.add_nodes_from(graph.nodes(data=True))
+    for a, b, data in graph.edges(data=True):
+        cells = data["cells"] if data["cells"][0] == a else data["cells"][::-1]
+        width = np.array([clear[cell] for cell in cells])
+        cut = [0]
+        for k in range(1, len(cells) - 1):
+            before, after = width[max(0, k - within) : k], width[k + 1 : k + 1 + within]
+            narrow = width[k] <= DOOR and width[k] < before.min() + CELL / 10 and width[k] <= after.min()
+            if narrow and width[k] * WIDER <= min(before.max(), after.max()) and (k - cut[-1] > within / 2 or cut[-1] == 0):
+                cut.append(k)
+                opened.add_node(cells[k], cell=cells[k], clear=float(width[k]), door=True)
+        for start, end in pairwise([*cut, len(cells) - 1]):
+            _join(opened, cells[start : end + 1])
+    return opened
 
 
 def lay(axes: Any, skeleton: Skeleton, poses: Sequence[Pose]) -> None:

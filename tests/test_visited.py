@@ -8,9 +8,10 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import networkx as nx
 import numpy as np
 import pytest
-from skeleton import CELL, _chains, _pixels, _prune, poses_of, skeleton_of
+from skeleton import CELL, _chains, _pixels, _prune, _with_doors, poses_of, skeleton_of
 from visited import ACES_COLUMNS, ACES_NAMES, ACES_ROUTE, ACES_ROWS, Events, Truth, Visit, judged, passes, truth_of, visits_of, with_names
 
 from perception.readers.scans import Laser, RobotLog, Scan
@@ -126,6 +127,17 @@ def test_a_ring_has_one_node() -> None:
     thin[2:4, 2:6] = False
     graph = _chains(_pixels(thin))
     assert (len(graph), [round(data["metres"], 6) for *_, data in graph.edges(data=True)]) == (1, [1.6])
+
+
+def test_a_narrow_part_of_an_edge_is_a_door() -> None:
+    width = np.full(100, 1.0)
+    width[40:43], width[60:100] = (0.6, 0.5, 0.6), 0.7  # a door, and from there on a corridor that is narrow and stays so
+    graph = nx.MultiGraph()
+    graph.add_nodes_from([(0, 0), (0, 99)])
+    graph.add_edge((0, 0), (0, 99), cells=[(0, k) for k in range(100)], metres=9.9)
+    opened = _with_doors(graph, width[None, :])
+    assert sorted(opened) == [(0, 0), (0, 41), (0, 99)]
+    assert sum(data["metres"] for *_, data in opened.edges(data=True)) == pytest.approx(9.9)
 
 
 def crossing() -> RobotLog:
