@@ -257,8 +257,8 @@ def _with_doors(graph: nx.MultiGraph, clear: Array) -> nx.MultiGraph:
     within = round(2.0 / CELL)
     opened = nx.MultiGraph()
     opened.add_nodes_from(graph.nodes(data=True))
-    for a, b, data in graph.edges(data=True):
-        cells = data["cells"] if data["cells"][0] == a else data["cells"][::-1]
+    for *_, data in graph.edges(data=True):
+        cells = data["cells"]
         width = np.array([clear[cell] for cell in cells])
         cut = [0]
         for k in range(1, len(cells) - 1):
