@@ -1,6 +1,6 @@
 """Writes the tables of a stored run into the pages that show them.
 
-    python benchmarks/readme.py RESULTS.json             # of bench.py: six rows into the README, all rows into docs/performance.md
+    python benchmarks/readme.py RESULTS.json             # of bench.py: three rows into the README, all rows into docs/performance.md
     python benchmarks/readme.py RESULTS.json ablation    # of ablation.py: into docs/performance.md
 
 Each table stands between two comments that name it; what is around them stays.
@@ -19,10 +19,10 @@ from table import times
 
 ROOT = Path(__file__).parent.parent
 PROJECT = "https://github.com/ssh-abduction/ssh-abduction/blob/main"  # links of the README are absolute, as it is shown on PyPI, too
-PAGES = {"six": ROOT / "README.md", "peers": ROOT / "docs" / "performance.md", "ablation": ROOT / "docs" / "performance.md"}
+PAGES = {"few": ROOT / "README.md", "peers": ROOT / "docs" / "performance.md", "ablation": ROOT / "docs" / "performance.md"}
 
-# The rows of the README: three that some peer proves about as soon or sooner, one that nobody proves, and two that only we prove.
-SIX = ("rectangle n=400", "rectangle n=400000", "moore 8/2 n=800", "moore 50/2 n=3200", "moore 100/10 n=3200", "maze 4x4 n=1600")
+# The rows of the README: one that some peers prove sooner, one that nobody proves, and one that only we prove.
+FEW = ("rectangle n=400", "moore 50/2 n=3200", "maze 4x4 n=1600")
 
 
 def block(name: str, results: dict[str, Any], path: Path) -> str:
@@ -30,8 +30,8 @@ def block(name: str, results: dict[str, Any], path: Path) -> str:
     machine, versions = results["machine"], ", ".join(f"{package} {number}" for package, number in results["packages"].items())
     measured = f"{results['date']}, {machine['cpu']}, {machine['cores']} cores"
     limits = f"{results['limit']:g} s and {results['memory']:,} MiB a cell"
-    if name == "six":
-        shown = times({**results, "cells": [cell for cell in results["cells"] if cell["instance"] in SIX]})
+    if name == "few":
+        shown = times({**results, "cells": [cell for cell in results["cells"] if cell["instance"] in FEW]})
         return f"{_narrow(shown)}\n\n{measured}; {limits}. From [this run]({PROJECT}/{path.relative_to(ROOT).as_posix()}).\n"
     seeds = "one trace of each kind" if results["seeds"] == 1 else f"medians over {results['seeds']} traces of each random kind"
     source = os.path.relpath(path, PAGES[name].parent).replace(os.sep, "/")
@@ -55,7 +55,7 @@ def rewritten(page: str, name: str, results: dict[str, Any], path: Path) -> str:
 def main() -> None:
     path = Path(sys.argv[1]).resolve()
     results = json.loads(path.read_text(encoding="utf-8"))
-    for name in sys.argv[2:] or ["six", "peers"]:
+    for name in sys.argv[2:] or ["few", "peers"]:
         page = PAGES[name]
         page.write_text(rewritten(page.read_text(encoding="utf-8"), name, results, path), encoding="utf-8")
 

@@ -175,13 +175,13 @@ def test_each_table_shows_a_stored_run(name: str) -> None:
     assert readme.block(name, run, stored(text, name)) in text
 
 
-def test_the_tables_of_peers_are_of_one_run_and_the_short_one_has_six_rows() -> None:
-    path = stored(readme.PAGES["six"].read_text(), "six")
+def test_the_tables_of_peers_are_of_one_run_and_the_short_one_has_few_rows() -> None:
+    path = stored(readme.PAGES["few"].read_text(), "few")
     assert path == stored(readme.PAGES["peers"].read_text(), "peers")
     run = json.loads(path.read_text())
-    rows = [line for line in readme.block("six", run, path).splitlines() if line.startswith("| ")]
-    assert len(rows) == 6 + 2
-    assert set(readme.SIX) <= set(SUITE)
+    rows = [line for line in readme.block("few", run, path).splitlines() if line.startswith("| ")]
+    assert len(rows) == len(readme.FEW) + 2 == 5
+    assert set(readme.FEW) <= set(SUITE)
 
 
 def test_the_table_of_speedups_has_each_of_them() -> None:
