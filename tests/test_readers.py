@@ -133,6 +133,7 @@ def test_without_true_poses_none_are_read(tmp_path: Path, name: str) -> None:
     scans = [Scan(s.ranges, s.laser, s.odometry) for s in drive(4)]
     (write_bag if name in BAGS else write_carmen)(tmp_path / name, scans)
     log = read_log(tmp_path / name)
+    assert "times of recording" not in " ".join(log.notes)  # though the first time is 0
     assert [scan.corrected for scan in log.scans] == [None] * 4
     assert [scan.time for scan in log.scans] == [0, 1, 2, 3]
 
@@ -530,6 +531,12 @@ def test_a_damaged_line_is_skipped_and_told(tmp_path: Path, what: str) -> None:
     assert [scan.line for scan in log.scans] == [1, 2, 4, 5, 6]
     streamed = list(stream_log(tmp_path / "a.log"))
     assert [type(item) for item in streamed] == [Scan, Scan, Damage, Scan, Scan, Scan]
+
+
+def test_a_mark_of_the_encoding_costs_no_scan(tmp_path: Path) -> None:
+    (tmp_path / "a.log").write_text(flaser(START, START), encoding="utf-8-sig")
+    log = read_log(tmp_path / "a.log")
+    assert (len(log), log.damaged) == (1, ())
 
 
 def test_what_no_reader_knows_is_no_damage(tmp_path: Path) -> None:

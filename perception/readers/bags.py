@@ -47,7 +47,7 @@ class _Damaged(Exception):  # noqa: N818 - becomes a Damage
 
 @dataclass
 class _Track:
-    """Poses over time, which come one after another. Each has two times: that of its header, NaN where there is none, and that at which it was recorded."""
+    """Poses over time, which come one after another. Each has two times: that of its header, 0 where there is none, and that at which it was recorded."""
 
     numbers: array[float] = field(default_factory=lambda: array("d"))
 
@@ -347,7 +347,7 @@ def _has_one_clock(track: _Track, laser_offset: float) -> bool:
     """Whether the times in headers can be used."""
     table = track.table()
     stamps = table[:, 0]
-    if not np.isfinite(stamps).all() or (np.diff(stamps) < -SAME_CLOCK).any():
+    if not stamps.any() or (np.diff(stamps) < -SAME_CLOCK).any():
         return False
     return bool(abs(stamps[0] - table[0, 1] - laser_offset) <= SAME_CLOCK)
 
@@ -416,9 +416,8 @@ def _rotation(q: Any) -> NDArray[np.float64]:
 
 
 def _stamp(header: Any) -> float:
-    """The time of a header, in seconds; NaN where there is none."""
-    time = header.stamp.sec + header.stamp.nanosec * NANO
-    return time or math.nan
+    """The time of a header, in seconds; 0 where there is none."""
+    return float(header.stamp.sec + header.stamp.nanosec * NANO)
 
 
 def _name(frame: str) -> str:

@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 import zlib
+from codecs import BOM_UTF8
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +28,13 @@ def opened(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
     Raises LogError.
     """
     try:
-        with Path(path).open("rb") as file:
+        file = Path(path).open("rb")  # noqa: SIM115 - it is closed below
+    except OSError as error:
+        raise _unreadable(path, error) from None
+    except ValueError as error:  # a null character in the path
+        raise LogError(f"{named(path)}: expected the path of a log: {error}") from None
+    try:
+        with file:
             if file.seekable():
                 yield file
                 return
@@ -35,11 +42,11 @@ def opened(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
                 shutil.copyfileobj(file, copy)
                 yield cast(IO[bytes], copy)
     except OSError as error:
-        raise LogError(f"{named(path)}: expected a readable log: {error.strerror or error}; check the path") from None
-    except ValueError as error:
-        if isinstance(error, LogError):
-            raise
-        raise LogError(f"{named(path)}: expected the path of a log: {error}") from None
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: str | os.PathLike[str], error: OSError) -> LogError:
+    return LogError(f"{named(path)}: expected a readable log: {error.strerror or error}; check the path")
 
 
 def is_gzip(file: IO[bytes]) -> bool:
@@ -60,7 +67,7 @@ def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
         while line := unpacked.readline(LONGEST_LINE + 1):
             number += 1
             if len(line) <= LONGEST_LINE:
-                yield number, line
+                yield number, line if number > 1 else line.removeprefix(BOM_UTF8)
                 continue
             while line and not line.endswith(b"\n"):
                 line = unpacked.readline(LONGEST_LINE)
