@@ -6,12 +6,14 @@ import argparse
 import gzip
 import http.client
 import json
+import re
 import shutil
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.cli.options import add_theory, flags_of, theory_of
 from ssh_abduction.maps import Fault
 from ssh_abduction.maps import Path as MapPath
+from ssh_abduction.rivals.page import html
 from ssh_abduction.rivals.page.content import content_of
 from ssh_abduction.rivals.page.html import Page
 from ssh_abduction.rivals.page.images import ALPHABET, LOST, beams_of, drawn_images
@@ -88,13 +91,13 @@ def hostile() -> tuple[Solution, Trace]:
 
 def test_page_is_one_file_that_loads_nothing_and_keeps_texts_as_texts() -> None:
     solution, trace = hostile()
-    html = view_page(solution, trace, run=trace[:3], beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace[:3])).html
+    text_of_page = view_page(solution, trace, run=trace[:3], beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace[:3])).html
     for text in [*HOSTILE, "<b>", "\u2028"]:
-        assert text not in html.replace('"onload="', "") or text == "<script>"
-    assert html.count("<script") == html.count("</script>") == 2
-    assert "default-src 'none'" in html
-    assert "http://" not in html.replace("http://www.w3.org/2000/svg", "")
-    assert "https://" not in html
+        assert text not in text_of_page
+    assert text_of_page.count("<script") == text_of_page.count("</script>") == 2
+    assert "default-src 'none'" in text_of_page
+    assert "http://" not in text_of_page.replace("http://www.w3.org/2000/svg", "")
+    assert "https://" not in text_of_page
 
 
 def test_ranges_are_drawn_at_the_bearings_that_the_header_says() -> None:
@@ -142,6 +145,40 @@ def test_beliefs_are_those_of_the_localiser_in_each_rival() -> None:
     assert [len(one["steps"]) for one in other["replays"]] == [4, 8]
     with pytest.raises(MapError, match="expected 4, one for each step"):
         view_page(solution, trace, run=trace[2:6], beliefs=lambda ssh_map: [])
+
+
+def test_colours_can_be_told_apart_by_the_colour_blind_and_from_the_paper() -> None:
+    light, dark = re.findall(r":root \{([^}]*)\}", (Path(html.__file__).parent / "page.css").read_text())
+    for theme in (light, dark):
+        found = {name: linear(colour) for name, colour in re.findall(r"--(\w+): (#\w+)", theme)}
+        bright = {name: float(colour @ [0.2126, 0.7152, 0.0722]) + 0.05 for name, colour in found.items()}
+        drawn = [name for name in found if name not in ("paper", "panel", "rule")]
+        assert min(max(bright[name] / bright["paper"], bright["paper"] / bright[name]) for name in drawn) > 3
+        assert max(bright["ink"] / bright["paper"], bright["paper"] / bright["ink"]) > 12
+        for together in (["few", "half", "most", "soft"], [f"path{k}" for k in range(6)]):
+            for seen in DEFICIENT.values():
+                labs = [cielab(np.array(seen) @ found[name]) for name in together]
+                assert min(np.linalg.norm(a - b) for a, b in combinations(labs, 2)) > 20
+
+
+# What the eye makes of linear red, green and blue: as all see, and without one kind of cone (Machado, Oliveira & Fernandes 2009, severity 1).
+DEFICIENT = {
+    "none": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]],
+}
+
+
+def linear(colour: str) -> Any:
+    digits = colour[1:] if len(colour) == 7 else "".join(2 * c for c in colour[1:])
+    c = np.array([int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)])
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+
+
+def cielab(rgb: Any) -> Any:
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    x, y, z = np.cbrt(np.maximum(to_xyz @ np.clip(rgb, 0, 1) / [0.9505, 1, 1.089], 0.0005))
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
 def test_flags_of_a_theory_make_it_again() -> None:

@@ -28,7 +28,7 @@ Steps: TypeAlias = tuple[int, ...]
 Spot: TypeAlias = tuple[float, float, float | None]
 
 DRAWING = 3.0  # seconds of the processor that drawings of other maps than the first may take together
-DRAWN = 20_000  # dstates that all drawings may have together: with more of them the page would be large
+DRAWN = 10_000  # dstates that all drawings may have together: with more of them the page would be large
 BELIEVING = 5.0  # seconds of the processor that beliefs in other maps than the first may take together
 BELIEVED = 12  # dstates of a belief that are shown at most
 LEAST = 0.01  # of this probability at least
@@ -269,8 +269,8 @@ def _numbers(found: Layout, ssh_map: SSHMap) -> dict[str, Any]:
     return {
         "metric": found.metric,
         "unit": round(unit, 3),
-        "places": [[p, round(x / unit, 3), round(y / unit, 3)] for p, (x, y) in found.places.items()],
-        "dstates": [[round(x / unit, 3), round(y / unit, 3), None if h is None else round(h, 3)] for x, y, h in found.dstates],
+        "places": [[p, round(x / unit, 2), round(y / unit, 2)] for p, (x, y) in found.places.items()],
+        "dstates": [[round(x / unit, 2), round(y / unit, 2), None if h is None else round(h, 2)] for x, y, h in found.dstates],
         **({"ellipses": _ellipses(found, ssh_map, unit)} if found.metric else {}),
     }
 

@@ -297,14 +297,14 @@ function paintFigure(figure) {
     const circle = element("svg:circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: r.toFixed(1), class: classes("node", node.kind) }, null, figure.base);
     element("svg:title", {}, node.title, circle);
     keep(figure, x, y, r, r);
-    if (node.name && r >= 6) element("svg:text", { class: "name inside", x: x.toFixed(1), y: y.toFixed(1), "font-size": Math.min(12, r * 1.15).toFixed(1) }, node.name, figure.base);
+    if (node.name && r >= 6) element("svg:text", { class: "name inside", x: x.toFixed(1), y: y.toFixed(1), "font-size": Math.min(12, r * 1.15, (3 * r) / node.name.length).toFixed(1) }, node.name, figure.base);
   });
   paintMarks(figure, see, r);
   const named = new Set();
-  for (const m of figure.marks) if (m.name && (apart > 34 || m.bare)) label(figure, m.name, [m.x, m.y], m.size + 2, around(m));
+  for (const m of figure.marks) if (m.name && (apart > 60 || (m.bare && apart > 24))) label(figure, m.name, [m.x, m.y], m.size + 2, around(m));
   for (const street of figure.streets) if (street.path !== undefined && !named.has(street.path)) {
     const [[ax, ay], [bx, by]] = [see(street.a), see(street.b)], far = Math.hypot(bx - ax, by - ay) || 1, [nx, ny] = [-(by - ay) / far, (bx - ax) / far];
-    if (far > 60 && [0.5, 0.35, 0.65].some((part) => label(figure, `path ${street.path}`, [ax + (bx - ax) * part, ay + (by - ay) * part], 6, [[nx, ny], [-nx, -ny]], classes("path", coloured(street.colour))))) named.add(street.path);
+    if (far > 60 && [0.5, 0.35, 0.65].some((part) => label(figure, `path ${street.path}`, [ax + (bx - ax) * part, ay + (by - ay) * part], 6, [[nx, ny], [-nx, -ny]], "path"))) named.add(street.path);
   }
   paintFaults(figure, r);
   paintScale(figure);
@@ -673,8 +673,7 @@ function tellVerdict(a, b) {
   $("verdict").textContent = `Steps ${a} and ${b}: ${verdict}${places}.`;
   const least = Math.min(best.same, best.different), cost = {};
   for (const side of ["same", "different"]) {
-    const other = side === "same" ? "different" : "same";
-    cost[side] = best[side] === least ? "costs nothing" : best[side] < Infinity ? `${best[side]} dstates in the best map listed, not ${least}` : proven ? `more than the ${least} dstates of these maps, if there is such a map` : `not listed: no map with ${best[other]} dstates of those listed`;
+    cost[side] = best[side] === least ? "costs nothing" : best[side] < Infinity ? `${best[side]} dstates in the best map listed, not ${least}` : proven ? `more than the ${least} dstates of these maps, if there is such a map` : "no map listed has them so";
   }
   tellCosts(cost);
 }
