@@ -38,16 +38,17 @@ from ssh_abduction import (
 from ssh_abduction.asp.process import _under_way
 from ssh_abduction.cli import main
 from ssh_abduction.cli.options import add_theory, flags_of, theory_of
-from ssh_abduction.maps import Fault
+from ssh_abduction.maps import Fault, Fit, Pose
 from ssh_abduction.maps import Path as MapPath
 from ssh_abduction.rivals.page import html
-from ssh_abduction.rivals.page.content import content_of
+from ssh_abduction.rivals.page.content import DRAWN, content_of
 from ssh_abduction.rivals.page.html import Page
 from ssh_abduction.rivals.page.images import ALPHABET, LOST, beams_of, drawn_images
 from ssh_abduction.rivals.page.server import PageServer
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ROUTE = EXAMPLES / "aces3-route.jsonl"
+CORRIDOR = Trace.from_steps("abcbabcba", ["on"] * 8)  # to and fro, in four dstates
 EVIL = "<script>alert(1)</script>"
 HOSTILE = [EVIL, "</script><b>", '"onload="alert(1)', "\u2028-->", "<!--<script>"]
 
@@ -193,15 +194,19 @@ def test_flags_of_a_theory_make_it_again() -> None:
         assert theory_of(parser.parse_args(flags_of(theory))) == theory
 
 
-def test_page_of_many_maps_of_500_dstates_is_small() -> None:
-    places, maps = 250, []
-    for k in range(150):
-        dstates = tuple(DState(i, f"v{i % 40}", i // 2, (i // 2 + k * (i > 480)) % 7, 1 if i % 2 else -1) for i in range(2 * places))
-        paths = tuple(MapPath(h, tuple(p for p in range(places) if p % 7 == h)) for h in range(7))
-        maps.append(
-            SSHMap(tuple(range(500)), dstates, tuple((i, "on", i + 1) for i in range(499)), tuple(range(places)), paths).renumbered()
-        )
-    assert len(gzip.compress(view_page(maps).html.encode())) < 250_000
+def test_page_of_many_maps_of_500_dstates_in_metres_is_small() -> None:
+    """As many drawings as a page holds, with poses that differ in each; more maps share those."""
+    rng, places, maps = np.random.default_rng(0), 250, []
+    for k in range(DRAWN // 500 + 10):
+        dstates = tuple(DState(i, f"v{i % 40}", i // 2, i // 2 * (k + 1) % 31, 1 if i % 2 else -1) for i in range(2 * places))
+        paths = tuple(MapPath(h, tuple(p for p in range(places) if p * (k + 1) % 31 == h)) for h in range(31))
+        at = rng.normal(size=(500, 3)) + [[5 * (i // 2 % 16), 5 * (i // 32), 0] for i in range(500)]
+        fit = Fit(1.0, 1, 0.5, poses=tuple(Pose(x, y, heading, (0.1, 0.02, 0.05)) for x, y, heading in at.tolist()))
+        maps.append(SSHMap(tuple(range(500)), dstates, tuple((i, "on", i + 1) for i in range(499)), tuple(range(places)), paths, fit=fit))
+    found = view_page(maps)
+    assert sum("layout" in told for told in found.content["maps"]) == DRAWN // 500
+    assert len(found.content["layouts"][0]["ellipses"]) == places
+    assert len(gzip.compress(found.html.encode())) < 250_000
 
 
 def test_trace_of_other_maps_is_refused(rivals: Solution, route: Trace) -> None:
@@ -233,8 +238,8 @@ def shown_in(page: str) -> Any:
 
 
 @pytest.fixture(scope="module")
-def server(rivals: Solution, route: Trace) -> Iterator[PageServer]:
-    with PageServer(Listing.of(rivals), route, rivals.theory) as served:
+def server() -> Iterator[PageServer]:
+    with PageServer(Listing.of(solve(CORRIDOR, Theory.causal())), CORRIDOR, Theory.causal()) as served:
         thread = threading.Thread(target=served.serve_forever, args=(0.05,))
         thread.start()
         yield served
@@ -266,7 +271,7 @@ def test_server_answers_only_who_knows_its_token_from_this_computer(server: Page
 
 def test_question_whose_asker_is_gone_is_given_up(server: PageServer, monkeypatch: pytest.MonkeyPatch) -> None:
     own = server.url.partition(str(server.port))[2]
-    monkeypatch.setattr("ssh_abduction.rivals.page.server._solved", sleep)
+    monkeypatch.setattr("ssh_abduction.rivals.page.answers.solved", sleep)
     with socket.create_connection(("127.0.0.1", server.port)) as connection:
         connection.sendall(
             f"POST {own}solve HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{{}}".encode()
@@ -287,16 +292,16 @@ def until(happened: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
-def test_server_solves_under_what_is_assumed_and_explains(server: PageServer, route: Trace) -> None:
+def test_server_solves_under_what_is_assumed_and_explains(server: PageServer) -> None:
     own = server.url.partition(str(server.port))[2]
-    told = json.loads(asked(server, "POST", own + "solve", {"different": [[0, 9]]})[1])
-    assert told["text"] == solve(route, Theory.topological().replace(different=((0, 9),)), maps=100).headline
-    assert not any(entry["labels"][0] == entry["labels"][9] for entry in told["content"]["labelings"])
-    why = json.loads(asked(server, "POST", own + "explain", {"pair": [0, 2]})[1])
-    assert "steps 0 and 2 are different dstates" in why["text"]
-    assert why["assuming"]["different"] == "costs nothing, as it holds in every map"
+    told = json.loads(asked(server, "POST", own + "solve", {"different": [[0, 4]]})[1])
+    assert told["text"] == solve(CORRIDOR, Theory.causal().replace(different=((0, 4),)), maps=100).headline
+    assert not any(entry["labels"][0] == entry["labels"][4] for entry in told["content"]["labelings"])
+    why = json.loads(asked(server, "POST", own + "explain", {"pair": [0, 4]})[1])
+    assert "steps 0 and 4 are one dstate in every minimal map" in why["text"]
+    assert why["assuming"] == {"same": "costs nothing: 4 dstates", "different": "5 dstates, not 4"}
     wrong = json.loads(asked(server, "POST", own + "explain", {"pair": [0, 99]})[1])
-    assert "from 0 to 22" in wrong["error"]
+    assert "from 0 to 8" in wrong["error"]
 
 
 @pytest.fixture(scope="module")
@@ -400,14 +405,17 @@ def test_hostile_texts_stay_texts_in_the_browser(browser: Any, tmp_path: Path) -
 
 def test_assuming_and_explaining_in_the_browser(browser: Any, server: PageServer) -> None:
     page = Shown(browser, server.url)
-    page.click("one")
-    page.choose(0)
-    page.browser.execute_script("const i = document.getElementById('later'); i.value = 9; i.dispatchEvent(new Event('change'))")
-    page.until("answer", "one dstate in every minimal map")  # which is asked as soon as two are chosen
-    assert "20 dstates, not 19" in page["costs"].text
-    page.click("different")
-    page.until("answer", "With steps 0 and 9 assumed different: optimal: 20 dstates")
-    assert "--different 0,9" in page["sentence"].text
+    page.choose(0, 1)
+    page.until("answer", "different dstates in every map")  # which is asked as soon as two are chosen
+    assert "no map satisfies the axioms" in page["costs"].text
+    page.browser.execute_script(
+        "for (const [id, t] of [['first', 0], ['later', 4]]) $(id).value = t; $('later').dispatchEvent(new Event('change'))"
+    )
+    page.click("different")  # which gives up what was asked before
+    page.until("answer", "With steps 0 and 4 assumed different: optimal: 5 dstates")
+    assert "--different 0,4" in page["sentence"].text
     page.click("forget")
-    page.until("answer", "optimal: 19 dstates")
+    page.until("answer", "optimal: 4 dstates")
+    page.browser.execute_script("why(); $('stop').click()")
+    assert page["answer"].text == "Given up."
     assert page.complaints == []

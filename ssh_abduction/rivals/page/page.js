@@ -705,7 +705,7 @@ async function ask(question, body) {
   since();
   const clock = setInterval(since, 500);
   try {
-    const response = await fetch(question, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body), signal: mine.signal });
+    const response = await fetch(new URL(question, location.href.replace(/\/?$/, "/")), { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body), signal: mine.signal });
     if (!response.ok) throw new Error(`the server refused (${response.status}); open the address that view --serve printed`);
     const told = await response.json();
     if (told.error) throw new Error(told.error);

@@ -24,19 +24,17 @@ from typing import Any
 from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.asp.process import in_process
 from ssh_abduction.errors import MapError, SSHError, brief, is_whole
-from ssh_abduction.rivals.explain import PairExplanation, explain_pair
 from ssh_abduction.rivals.listing import Listing
+from ssh_abduction.rivals.page import answers
 from ssh_abduction.rivals.page.content import Called, Run, content_of
 from ssh_abduction.rivals.page.html import html_of
-from ssh_abduction.solver.result import Solution
-from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
 LARGEST = 100_000  # bytes of a question
 POLL = 0.1  # seconds after which it is looked whether who asked is still there
 # An answer has so many times its limit and so many seconds more, for the process to begin and for what cannot be interrupted, before the process is ended.
-NET, MORE = 1.2, 2.0
+NET, MORE = 1.2, 5.0
 
 
 class PageServer(ThreadingHTTPServer):
@@ -92,9 +90,9 @@ class PageServer(ThreadingHTTPServer):
         pair = self._pair(data.get("pair")) if question == "explain" else None
         with self._turn(watch):
             if pair is not None:
-                why = in_process(_explained, self._trace, *pair, theory, self._limit, watch=watch)
+                why = in_process(answers.explained, self._trace, *pair, theory, self._limit, watch=watch)
                 return {"text": str(why), "assuming": why.assuming}
-            found = in_process(_solved, self._trace, theory, self._maps, self._limit, watch=watch)
+            found = in_process(answers.solved, self._trace, theory, self._maps, self._limit, watch=watch)
         if not found.maps:
             return {"text": found.headline}
         return {"text": found.headline, "content": content_of(found, self._trace, self._run, self._called)}
@@ -225,11 +223,3 @@ def _while_there(connection: socket.socket, watch: Watch) -> Iterator[None]:
     finally:
         done.set()
         looking.join()
-
-
-def _explained(trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch) -> PairExplanation:
-    return explain_pair(trace, first, second, theory, limit=limit)
-
-
-def _solved(trace: Trace, theory: Theory, maps: int, limit: float | None, watch: Watch) -> Solution:
-    return solve(trace, theory, maps=maps, limit=limit)

@@ -1,0 +1,20 @@
+"""What a served page asks of the solver. It is asked in a process of its own, which begins sooner as nothing is imported here that draws."""
+
+from __future__ import annotations
+
+from ssh_abduction.asp.limits import Watch
+from ssh_abduction.rivals.explain import PairExplanation, explain_pair
+from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.search import solve
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Trace
+
+
+def explained(trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch) -> PairExplanation:
+    """Why two steps are one dstate or not. The watch is not needed, as the process is ended from outside."""
+    return explain_pair(trace, first, second, theory, limit=limit)
+
+
+def solved(trace: Trace, theory: Theory, maps: int, limit: float | None, watch: Watch) -> Solution:
+    """The minimal maps under a theory that holds what is assumed. The watch is not needed, as the process is ended from outside."""
+    return solve(trace, theory, maps=maps, limit=limit)
