@@ -29,7 +29,7 @@ THEMES: dict[str, tuple[str, ...]] = {
     "Maps": ("SSHMap", "DState", "Path", "Pose", "Fit"),
     "Rival maps": ("compare", "Comparison", "difference", "Difference", "Listing", "view_page", "Page"),
     "Why": ("rivals.explain.explain_pair", "rivals.explain.explain_trace", "explain.why_apart", "front.fault_front"),
-    "Is a map right?": ("evaluate", "Evaluation", "MapEvaluation", "ladder", "Rung"),
+    "Is a map right?": ("evaluate", "Evaluation", "MapEvaluation", "evaluate_visits", "VisitsEvaluation", "ladder", "Rung"),
     "Using a map": ("route", "Route", "Move", "export_map", "Localiser", "Belief", "Chances"),
     "While the robot drives": ("OnlineMapper", "next_experiment", "Experiment", "Explorer", "Exploration"),
     "From images to recognition": ("learner.BootstrapLearner", "perception.views.ViewClusterer", "perception.recognition.recogniser"),
