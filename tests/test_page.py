@@ -197,9 +197,10 @@ def test_flags_of_a_theory_make_it_again() -> None:
 def test_page_of_many_maps_of_500_dstates_in_metres_is_small() -> None:
     """As many drawings as a page holds, with poses that differ in each; more maps share those."""
     rng, places, maps = np.random.default_rng(0), 250, []
-    for k in range(DRAWN // 500 + 10):
-        dstates = tuple(DState(i, f"v{i % 40}", i // 2, i // 2 * (k + 1) % 31, 1 if i % 2 else -1) for i in range(2 * places))
-        paths = tuple(MapPath(h, tuple(p for p in range(places) if p * (k + 1) % 31 == h)) for h in range(31))
+    for _ in range(DRAWN // 500 + 10):
+        of_place = rng.integers(31, size=places).tolist()
+        dstates = tuple(DState(i, f"v{i % 40}", i // 2, of_place[i // 2], 1 if i % 2 else -1) for i in range(2 * places))
+        paths = tuple(MapPath(h, tuple(p for p in range(places) if of_place[p] == h)) for h in range(31))
         at = rng.normal(size=(500, 3)) + [[5 * (i // 2 % 16), 5 * (i // 32), 0] for i in range(500)]
         fit = Fit(1.0, 1, 0.5, poses=tuple(Pose(x, y, heading, (0.1, 0.02, 0.05)) for x, y, heading in at.tolist()))
         maps.append(SSHMap(tuple(range(500)), dstates, tuple((i, "on", i + 1) for i in range(499)), tuple(range(places)), paths, fit=fit))
