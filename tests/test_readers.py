@@ -218,6 +218,7 @@ def test_a_first_pose_that_wanders_is_a_corrected_one(tmp_path: Path) -> None:
         (181, [], 180 / 180, 9.0),
         (361, [], 180 / 360, 9.0),
         (361, ["PARAM laser_front_laser_fov 1.5707963 host 1"], 90 / 360, 9.0),
+        (361, ["PARAM laser_front_laser_fov 90 host 1"], 90 / 360, 9.0),
     ],
 )
 def test_where_beams_go_and_how_far(tmp_path: Path, beams: int, lines: list[str], step: float, reach: float) -> None:
@@ -231,8 +232,9 @@ def test_where_beams_go_and_how_far(tmp_path: Path, beams: int, lines: list[str]
     assert np.isinf(scan.ranges[1]) == (reach < 6)
 
 
-def test_the_codes_of_a_sick_are_no_ranges(tmp_path: Path) -> None:
-    scan = read_text(tmp_path / "a.log", flaser(START, START, ranges="81.91 81.87 40 2 1")).scans[0]
+@pytest.mark.parametrize("lines", [[], ["PARAM robot_front_laser_max 81.92 host 1"]])
+def test_the_codes_of_a_sick_are_no_ranges(tmp_path: Path, lines: list[str]) -> None:
+    scan = read_text(tmp_path / "a.log", *lines, flaser(START, START, ranges="81.91 81.87 40 2 1")).scans[0]
     assert scan.ranges.tolist() == [math.inf, math.inf, 40, 2, 1]
 
 
@@ -348,6 +350,9 @@ def bag(path: Path, messages: Callable[[Any], list[tuple[str, float, Any]]]) -> 
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         topics: dict[str, Any] = {}
         for topic, time, message in messages(Messages(store.types)):
+            if isinstance(message, bytes):  # a damaged one
+                writer.write(topics[topic], round(time * 1e9), message)
+                continue
             kind = message.__msgtype__
             topics[topic] = topics.get(topic) or writer.add_connection(topic, kind, typestore=store)
             writer.write(topics[topic], round(time * 1e9), store.serialize_cdr(message, kind))
@@ -449,6 +454,30 @@ def test_times_of_recording_are_used_where_headers_have_none_or_those_of_another
     log = read_log(path)
     assert [scan.odometry[0] for scan in log.scans] == [1.5, 2.5]
     assert "times of recording" in " ".join(log.notes)
+
+
+def test_a_damaged_message_is_skipped_and_told(tmp_path: Path) -> None:
+    def messages(m: Messages) -> list[tuple[str, float, Any]]:
+        no_step, no_ranges, nowhere = m.scan(1.0), m.scan(1.0), m.odometry(1.5, (math.nan, 0.0, 0.0))
+        no_step.angle_increment = math.nan
+        no_ranges.ranges = np.zeros(0, dtype=np.float32)
+        cut = b"\0\1\0\0" + bytes(9)
+        odometry = [m.odometry(1.0, (1.0, 0.0, 0.0)), cut, nowhere, m.odometry(2.0, (2.0, 0.0, 0.0))]
+        scans = [m.scan(1.0), cut, no_step, no_ranges, m.scan(2.0)]
+        return [("/odom", 1.0 + i / 3, message) for i, message in enumerate(odometry)] + [
+            ("/scan", 1.0 + i / 4, s) for i, s in enumerate(scans)
+        ]
+
+    log = read_log(bag(tmp_path / "bag", messages))
+    assert [scan.odometry[0] for scan in log.scans] == [1, 2]
+    assert [(damage.what.split(":")[0], damage.line) for damage in log.damaged] == [
+        ("/odom", 2),
+        ("/odom", 3),
+        ("/scan", 2),
+        ("/scan", 3),
+        ("/scan", 4),
+    ]
+    assert all("expected" in damage.what for damage in log.damaged)
 
 
 def test_several_topics_are_listed_and_can_be_named(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ MOUNTED = 0.02
 # Poses of vertices that nowhere differ more than so many metres from the chain of the edges have not been corrected.
 CORRECTED = 0.05
 # The ranges of a SICK LMS, in metres, from this one on are codes: "nothing came back", "dazzled", and the like (SICK, Telegrams for LMS 200, values 8183 to 8191).
-SICK_REACH, SICK_MOST = 81.83, 81.91
+SICK_REACH, SICK_MOST = 81.83, 81.92
 # Ranges in metres beyond this one are no measurement of any laser.
 NO_RANGE = 1000.0
 # Lines of CARMEN that say nothing here.
@@ -222,8 +222,7 @@ def _reach(found: _Found, survey: _Survey, kind: str, notes: list[str]) -> float
         return math.inf
     if (reach := found.parameters.get("reach", 0.0)) > 0:
         return reach
-    counted = survey.most if survey.repeated > 2 else math.ceil(survey.most)
-    reach = SICK_REACH if SICK_REACH <= survey.most <= SICK_MOST else counted
+    reach = _without_codes(survey.most if survey.repeated > 2 or survey.most > SICK_REACH else math.ceil(survey.most))
     notes.append(
         f"The log does not say how far the laser reaches. By its largest range, {survey.most:g} m, which came {survey.repeated} times, it is {reach:g} m."
     )
@@ -302,7 +301,8 @@ def _count(survey: _Survey, line: ScanLine) -> None:
 def _scans(file: IO[bytes], source: str, odometer: _Odometer, kind: str, mount: Pose, reach: float) -> Iterator[Scan | Damage]:
     """The scans, and what was skipped."""
     waiting: list[Scan | Damage] = []  # what waits for the next ODOM line, where the scans have no poses
-    fov = odometer.found.parameters.get("fov")
+    fov = odometer.found.parameters.get("fov", math.pi)
+    fov = math.radians(fov) if math.tau < fov <= 360 else fov if 0 < fov <= math.tau else math.pi  # some give degrees
     for number, raw in lines(file, source):
         tag = b""
         try:
@@ -410,17 +410,23 @@ class _Odometer:
         return moved(self.truth[0], between(self.truth[1], odometry)) if self.truth is not None else None
 
 
-def _measured(line: ScanLine, mount: Pose, reach: float, fov: float | None) -> tuple[NDArray[np.float64], Laser]:
+def _measured(line: ScanLine, mount: Pose, reach: float, fov: float) -> tuple[NDArray[np.float64], Laser]:
     beams = len(line.ranges)
     if line.shape is None:
-        laser = _conventional(beams, math.pi if fov is None or not 0 < fov <= math.tau else fov, reach, mount)
+        laser = _conventional(beams, fov, _without_codes(reach), mount)
     else:
-        laser = _described(*line.shape, beams, mount)
+        first, step, reach = line.shape
+        laser = _described(first, step, _without_codes(reach), beams, mount)
     ranges = line.ranges
     with np.errstate(invalid="ignore"):
         ranges[ranges >= laser.reach] = np.inf
         ranges[ranges <= 0] = np.nan
     return ranges, laser
+
+
+def _without_codes(reach: float) -> float:
+    """The reach of a laser, without what a SICK's ranges from there on are codes for."""
+    return SICK_REACH if SICK_REACH <= reach <= SICK_MOST else reach
 
 
 @lru_cache(maxsize=64)
