@@ -5,3 +5,7 @@ from ssh_abduction.errors import SSHError
 
 class SimulatorError(SSHError, ValueError):
     """A world, a pose or a tour that cannot be simulated. The text says what was expected, what came, and how to mend it."""
+
+
+class SimulatorWarning(UserWarning):
+    """A drive was simulated, but it may not be what was meant. The text says why."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
+from simulator.robot import OPTIONS
 from ssh_abduction.errors import brief, is_finite
 
 Array = NDArray[np.float64]
@@ -50,6 +51,7 @@ class Odometer:
             if not is_finite(value) or not least <= value <= WORST:
                 raise SimulatorError(
                     f"odometer.{field.name}: expected a number from {least:g} to {WORST:g}, got {brief(value)}; choose a smaller error"
+                    + (f" (--{OPTIONS[field.name]})" if field.name in OPTIONS else "")
                 )
 
     def as_noisy_as(self, along: float) -> Odometer:

@@ -15,6 +15,8 @@ from ssh_abduction.odometry import Displacement
 
 # The systematic errors of an odometry are at most this, as a share and in radians a metre: with more the robot could not tell when it has left a place.
 WORST = 0.5
+# The options of the verb that set these errors.
+OPTIONS = {"odometry": "odometry-noise", "scale": "scale-error", "bend": "bend-error"}
 
 
 @dataclass(frozen=True)
@@ -42,9 +44,9 @@ class Body:
         for name, least in (("odometry", 0.0), ("scale", -WORST), ("bend", -WORST)):
             value = getattr(self, name)
             if not is_finite(value) or not least <= value <= WORST:
-                unit = " radians a metre" if name == "bend" else ""
+                unit = f" radians a metre, which are {math.degrees(WORST):.1f} degrees" if name == "bend" else ""
                 raise SimulatorError(
-                    f"body.{name}: expected a number from {least} to {WORST}{unit}, got {brief(value)}; choose a smaller error"
+                    f"body.{name}: expected a number from {least} to {WORST}{unit}, got {brief(value)}; choose a smaller error (--{OPTIONS[name]})"
                 )
 
 

@@ -21,6 +21,7 @@ from simulator.motion import DIGITS
 from simulator.odometer import Odometer
 from simulator.panorama import Camera
 from simulator.robot import Body, Report, Robot
+from simulator.watch import Watch
 from simulator.world import World
 from ssh_abduction.odometry import Covariance, Displacement
 from ssh_abduction.odometry import Odometry as Noise
@@ -238,51 +239,55 @@ def _at_dstates(driver: Driver, log: Log, world: World, tours: int, stars: bool,
     if world.angles == "any":
         yield from _at_junctions(driver, log, world, tours, stars, eye)
         return
-    star = Star(world.reach)
-    climb(driver)
-    if stars:  # look behind, as the half circle does not show it
-        driver.go(0.0, math.pi)
-        star.facing = 2
-        star.look(driver.look(STILL))
-        driver.go(0.0, math.pi)
-        star.facing = 0
+    star, watch = Star(world.reach), Watch(world, driver, tours)
+    with watch.start():
         climb(driver)
+        if stars:  # look behind, as the half circle does not show it
+            driver.go(0.0, math.pi)
+            star.facing = 2
+            star.look(driver.look(STILL))
+            driver.go(0.0, math.pi)
+            star.facing = 0
+            climb(driver)
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
-        for number, action in enumerate(world.route):
+        for number, action in enumerate(world.route, tour * len(world.route)):
             image = driver.look(STILL)
             star.look(image)
             yield Step(
-                image=eye.image(driver, image, tour * len(world.route) + number),
+                image=eye.image(driver, image, number),
                 action=Action.of(action),
                 star=star.seen() if stars else None,
                 displacement=log.displacement(),
                 truth=_truth(world, driver.robot.pose),
             )
-            act(driver, action)
+            with watch.action(number, action):
+                act(driver, action)
             star.act(action)
 
 
 def _at_junctions(driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye) -> Iterator[Step]:
     """The same where streets meet at any angles. How much the robot turned to look around differs from step to step, so each displacement has a covariance of its own."""
-    pilot = Pilot(driver)
-    pilot.begin()
+    pilot, watch = Pilot(driver), Watch(world, driver, tours)
+    with watch.start():
+        pilot.begin()
     done = ""
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
-        for number, action in enumerate(world.route):
+        for number, action in enumerate(world.route, tour * len(world.route)):
             displacement = log.displacement()
             yield Step(
-                image=eye.image(driver, driver.look(STILL), tour * len(world.route) + number),
+                image=eye.image(driver, driver.look(STILL), number),
                 action=ACTIONS[action],
                 star=pilot.star() if stars else None,
                 displacement=displacement,
                 covariance=None if displacement is None else _covariance(log.reports[-1], driver.tolerance, done),
                 truth=_truth(world, driver.robot.pose),
             )
-            pilot.act(action)
+            with watch.action(number, action):
+                pilot.act(action)
             done = action
 
 
@@ -323,14 +328,16 @@ def _evenly(driver: Driver, log: Log, world: World, tours: int, every: float, ey
 
 def _legs(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]:
     """Drive all tours. Before each action its number, and what it is."""
-    pilot = Pilot(driver) if world.angles == "any" else None
-    pilot.begin() if pilot else climb(driver)
+    pilot, watch = Pilot(driver) if world.angles == "any" else None, Watch(world, driver, tours)
+    with watch.start():
+        pilot.begin() if pilot else climb(driver)
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
         for number, action in enumerate(world.route, tour * len(world.route)):
             yield number, action
-            pilot.act(action) if pilot else act(driver, action)
+            with watch.action(number, action):
+                pilot.act(action) if pilot else act(driver, action)
 
 
 def _truth(world: World, pose: Sequence[float]) -> dict[str, object]:

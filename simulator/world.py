@@ -71,6 +71,7 @@ class World:
     dstates   the truth, for evaluation only
     angles    the angles at which streets meet, which choose the control laws: right, or any
     places    where places are, in metres, by their names: those of the dstates, or those of a route of places
+    own_reach  the reach of the world's file, where another one was chosen
     via       points that are no places, through which a route of places may lead
     """
 
@@ -84,6 +85,7 @@ class World:
     angles: Angles = "right"
     places: Mapping[str, Point] = field(default_factory=dict, repr=False)
     via: Mapping[str, Point] = field(default_factory=dict, repr=False)
+    own_reach: float | None = None
 
     @property
     def by_places(self) -> bool:
@@ -148,7 +150,7 @@ class World:
             if not isinstance(route, str):
                 raise reader.wrong("route", "actions with commas between", route)
             world = replace(world, route=reader.route(route.split(","), world.stops))
-        return world if reach is None else replace(world, reach=reader.reach(reach))
+        return world if reach is None else replace(world, reach=reader.reach(reach), own_reach=world.own_reach or world.reach)
 
     @classmethod
     def named(cls, name: str) -> World:
@@ -181,7 +183,7 @@ class World:
         return cls(printable(name), segments, start=(float(middle[0]), float(middle[1]), 0.0))
 
 
-def _are_square(walls: Array) -> bool:
+def are_square(walls: Array) -> bool:
     """Whether nearly all walls, by their length, are along two directions that are at right angles."""
     ways = (walls[:, 2] - walls[:, 0]) + 1j * (walls[:, 3] - walls[:, 1])
     lengths = np.abs(ways)
@@ -309,7 +311,7 @@ class _Reader:
     def angles(self, value: Any, walls: Array) -> Angles:
         if value not in (None, "right", "any"):
             raise self.wrong("angles", '"right" or "any"', value)
-        chosen: Angles = value or ("right" if _are_square(walls) else "any")
+        chosen: Angles = value or ("right" if are_square(walls) else "any")
         return chosen
 
     def pose(self, value: Any, name: str) -> tuple[float, float, float]:

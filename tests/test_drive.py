@@ -18,7 +18,7 @@ from simulator.buildings import Building
 from simulator.control import Driver
 from simulator.cruise import follow
 from simulator.drive import Recorder
-from simulator.errors import SimulatorError
+from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.freespace import FreeSpace
 from simulator.laser import Laser
 from simulator.motion import between
@@ -30,7 +30,7 @@ from simulator.tours import record, simulate
 from simulator.world import World
 from ssh_abduction.cli import main
 
-RECTANGLE = World.named("notched-rectangle")
+RECTANGLE, HALL = World.named("notched-rectangle"), World.named("taylor-hall")
 
 
 @pytest.fixture
@@ -245,6 +245,32 @@ def test_a_route_of_places_that_cannot_be_driven(tmp_path: Path) -> None:
         record(World.load(tmp_path / "world.json"))
     with pytest.raises(SimulatorError, match=r"route: expected actions, got places, .*; write --as carmen"):
         simulate(World.load(tmp_path / "world.json"))
+
+
+# What goes wrong is noticed
+
+
+@pytest.mark.parametrize(
+    ("world", "body", "laser", "message"),
+    [
+        (HALL.with_choices(reach=0.6), None, None, r"action 5 of tour 1, travel: expected the robot to come to D2 at \(13\.00, -10\.00\), got it at \(13\.4.*reach is 0\.6 m, and the world's own is 1 m"),
+        (replace(HALL, reach=1.3), None, None, r"expected the robot to come to P3 .*reach is 1\.3 m, and half the width of the street there is 1\.00 m"),
+        (HALL.with_choices(route="travel,right"), None, None, r"tour 1: expected it to end where it began, at \(0\.00, -15\.00\), got its end at .* 15\.0 m and 90 degrees off"),
+        (replace(World.named("three-ways"), angles="right"), None, None, 'walls meet at other than right angles, and the world says "right"'),
+        (replace(World.named("triangle"), start=(-2.0, 1.2, -2.1)), None, None, r"the start is 4\.3 m off the nearest dstate"),
+        (World.named("triangle"), None, Laser(noise=0.1), r"ranges err by 10 cm"),
+        (HALL, Body(slip=0.4), None, r"expected a free way ahead, got a wall; .*a motion errs by 40 %"),
+        (replace(RECTANGLE, start=(3.4, 1.4, 0.7), route=("travel",)), None, None, r"the start heads 40 degrees off the walls"),
+    ],
+)  # fmt: skip
+def test_what_goes_wrong_is_told_with_its_cause(world: World, body: Body | None, laser: Laser | None, message: str) -> None:
+    with pytest.raises(SimulatorError, match=message):
+        simulate(world, tours=2, seed=0, body=body, laser=laser)
+
+
+def test_a_single_tour_that_does_not_return_is_a_warning() -> None:
+    with pytest.warns(SimulatorWarning, match=r"tour 1: expected it to end where it began, .*; it cannot be driven again from there"):
+        assert len(simulate(RECTANGLE.with_choices(route="right"))) == 1
 
 
 # Driving around things

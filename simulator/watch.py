@@ -1,0 +1,150 @@
+"""Watches a drive: whether each action ends where the world says, and each tour where it began. What goes wrong is told with the action and the likely cause.
+
+The control laws see images alone, and do not know when they have taken one place for another. Here the true pose is compared with the true dstates of the world, where it has any.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from simulator.control import TURNS, Driver
+from simulator.errors import SimulatorError, SimulatorWarning
+from simulator.laser import meetings
+from simulator.motion import Pose, between
+from simulator.world import TrueDState, World, are_square
+
+# Metres, and radians, by which a robot may be off the place where it is to be; `reach` metres, if that is more.
+NEAR, FACING = 0.5, math.radians(45)
+# Of the way to the next place of a path, how far that may be to a side.
+STRAIGHT = 0.2
+# Errors of motions and of odometry, as a share, and of ranges, in metres, that the control laws do not bear for sure.
+NOISY, BLURRED = 0.1, 0.03
+
+
+@dataclass
+class Watch:
+    """Watches a driver on the tours of a world, as it is in its file."""
+
+    world: World
+    driver: Driver
+    tours: int
+    _home: Pose | None = field(default=None, init=False)
+
+    @contextmanager
+    def start(self) -> Iterator[None]:
+        """Watch how the robot comes to its first dstate."""
+        try:
+            yield
+        except SimulatorError as error:
+            raise SimulatorError(f"{error}{self._because()}") from None
+
+    @contextmanager
+    def action(self, number: int, name: str) -> Iterator[None]:
+        """Watch one action, which is counted on from tour to tour. Raises SimulatorError where it ends at another place than the world says, or a tour elsewhere than it began."""
+        before = self.driver.robot.pose
+        self._home = self._home or before
+        tour, place = divmod(number, len(self.world.route))
+        where = f"action {place + 1} of tour {tour + 1}, {name}"
+        try:
+            yield
+        except SimulatorError as error:
+            raise SimulatorError(f"{error} ({where}){self._because(before)}") from None
+        after = self.driver.robot.pose
+        expected = self._expected(name, before)
+        if expected and not self._is_at(expected, after):
+            raise SimulatorError(
+                f"{self.world.name}: {where}: expected the robot to come to {_at(expected.place, expected.pose)}, got it {_at('', after)}, "
+                f"{math.dist(expected.pose[:2], after[:2]):.1f} m off; so it drives another route than it was told{self._because(before)}"
+            )
+        if place == len(self.world.route) - 1:
+            self._ended(tour, after)
+
+    def _ended(self, tour: int, pose: Pose) -> None:
+        """Compare where a tour has ended with where the first one began."""
+        assert self._home is not None
+        if math.dist(pose[:2], self._home[:2]) <= self._near and abs(math.remainder(pose[2] - self._home[2], math.tau)) <= FACING:
+            return
+        text = f"{self.world.name}: tour {tour + 1}: expected it to end where it began, {_at('', self._home)}, got its end {_at('', pose)}, {_off(self._home, pose)}"
+        if self.tours == 1:
+            warnings.warn(f"{text}; it cannot be driven again from there", SimulatorWarning, stacklevel=2)
+        else:
+            raise SimulatorError(f"{text}; mend the route, or drive one tour{self._because()}")
+
+    @property
+    def _near(self) -> float:
+        return max(NEAR, self.world.reach)
+
+    def _is_at(self, state: TrueDState, pose: Pose) -> bool:
+        found = self.world.nearest(pose)
+        return found is not None and found.place == state.place and math.dist(pose[:2], state.pose[:2]) <= 2 * self._near
+
+    def _expected(self, action: str, pose: Pose) -> TrueDState | None:
+        """The dstate at whose place an action is to end, from a pose; None where the world does not say."""
+        here = self.world.nearest(pose)
+        if here is None or action in TURNS:
+            return here
+        ahead = []
+        for state in self.world.dstates:
+            x, y, _ = between(here.pose, state.pose)
+            if (state.path, state.direction) == (here.path, here.direction) and x > NEAR and abs(y) <= STRAIGHT * x:
+                ahead.append((x, state.name, state))
+        return min(ahead)[2] if ahead else None
+
+    def _because(self, before: Pose | None = None) -> str:
+        """The likely causes, as the end of a message; nothing where none is known. `before` is where the action began."""
+        found = list(self._causes(before or self.driver.robot.pose))
+        return f". Likely cause: {'; or '.join(found)}" if found else ""
+
+    def _causes(self, before: Pose) -> Iterator[str]:
+        world, body = self.world, self.driver.robot.body
+        if world.own_reach is not None and world.own_reach != world.reach:
+            yield f"reach is {world.reach:g} m, and the world's own is {world.own_reach:g} m (leave --reach out)"
+        elif (half := self._half_width(before)) and not (0.6 * half if world.angles == "any" else 0.0) <= world.reach <= 1.25 * half:
+            yield f"reach is {world.reach:g} m, and half the width of the street there is {half:.2f} m (give that as reach)"
+        if world.angles == "right" and not are_square(world.segments):
+            yield 'walls meet at other than right angles, and the world says "right" (write "angles": "any")'
+        for what, value, mend in (
+            ("the odometry errs", body.odometry, "give less --odometry-noise"),
+            ("a motion errs", body.slip, "give the body less slip"),
+        ):
+            if value > NOISY:
+                yield f"{what} by {100 * value:.0f} % ({mend})"
+        if abs(body.bend) > math.radians(2):
+            yield f"the odometry bends by {math.degrees(body.bend):.1f} degrees in each metre (give less --bend-error)"
+        if self.driver.laser.noise > BLURRED:
+            yield f"ranges err by {100 * self.driver.laser.noise:.0f} cm (give the laser less noise)"
+        start = world.nearest(world.start)
+        if start and (away := math.dist(start.pose[:2], world.start[:2])) > self._near:
+            yield f"the start is {away:.1f} m off the nearest dstate of the world, {start.name} (move the start)"
+        if world.angles == "right" and (off := _off_axis(world)) > FACING / 2:
+            yield f"the start heads {math.degrees(off):.0f} degrees off the walls (turn the start)"
+
+    def _half_width(self, before: Pose) -> float | None:
+        """Half the width of the street in which the robot has driven, in metres, without clutter, halfway from where it was before: across a street walls are nearest. None where there are no walls."""
+        angles = np.radians(np.arange(360.0))
+        middle = np.append((np.array(before[:2]) + self.driver.robot.pose[:2]) / 2, 0.0)
+        ranges = meetings(self.world.segments, middle[None], angles).min(2)[0]
+        narrowest = float((ranges[:180] + ranges[180:]).min())
+        return narrowest / 2 if math.isfinite(narrowest) else None
+
+
+def _off_axis(world: World) -> float:
+    """Radians between the start's heading and the nearest direction of the longest wall, or one at right angles to it."""
+    ways = world.segments[:, 2:] - world.segments[:, :2]
+    longest = ways[int(np.hypot(*ways.T).argmax())]
+    return abs(math.remainder(world.start[2] - math.atan2(longest[1], longest[0]), math.pi / 2))
+
+
+def _at(what: str, pose: Pose) -> str:
+    return f"{what} at ({pose[0]:.2f}, {pose[1]:.2f})".lstrip()
+
+
+def _off(one: Pose, other: Pose) -> str:
+    turned = math.degrees(abs(math.remainder(one[2] - other[2], math.tau)))
+    return f"{math.dist(one[:2], other[:2]):.1f} m and {turned:.0f} degrees off"
