@@ -245,7 +245,7 @@ class Axioms:
         self._conclusions: list[clingo.Symbol] = []
         self._seen: list[_Seen] = []
         self._last_core: tuple[int, ...] = ()  # of what was assumed last, as clingo's literals, a part that cannot all hold
-        self._control = clingo.Control(["--warn=none"])
+        self._control = clingo.Control(["--warn=none", *(["--heuristic=Domain"] if relaxed else [])])
         names = [name for name in facts.encoding_names(theory) if name != "preference"]
         for name in [*names, "explain", "derivation"] if relaxed else names:
             self._control.load(encodings.path(name))

@@ -196,7 +196,9 @@ def some_fail() -> Symbol:
 
 def may_fail(conclusions: Iterable[Symbol]) -> str:
     """The rules that say so."""
-    return "\n".join(f"#external {picked(c)}. {some_fail()} :- {picked(c)}, not {c}." for c in conclusions)
+    return "\n".join(
+        f"#external {picked(c)}. {some_fail()} :- {picked(c)}, not {c}. #heuristic {c} : {picked(c)}. [1,false]" for c in conclusions
+    )
 
 
 def are_one(first: int, second: int) -> Symbol:

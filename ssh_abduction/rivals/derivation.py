@@ -50,8 +50,10 @@ _WORDS = {
     "branch_left": "{path1} {leaves} to the left of {path0}",
     "right": "step {0} {is} at a place to the right of {path1}",
     "left": "step {0} {is} at a place to the left of {path1}",
-    "turned": "steps {0} and {1} {are} at one place, and step {1} {faces} {2} quarters clockwise from step {0}",
+    "turned": "steps {0} and {1} {are} at one place, and step {1} {faces} {turn} step {0}",
 }
+# How a step faces that faces so many quarters clockwise from another one.
+_TURNED = ("the same way as", "a quarter to the right of", "the opposite way of", "a quarter to the left of")
 # Conclusions that say most are kept where one of several would do.
 _PREFERRED = (
     "on",
@@ -418,16 +420,19 @@ class _Words:
         name, steps = conclusion
         if name in ("one_dstate", "one_place", "two_places", "two_dstates", "one_course", "opposite", "two_paths"):
             steps = tuple(sorted(steps))
-        shown = [str(self._piece.steps[t]) if not (name == "turned" and k == 2) else str(t) for k, t in enumerate(steps)]
+        turn = ""
+        if name == "turned":
+            steps, turn = steps[:2], _TURNED[steps[2]]
+        shown = [str(self._piece.steps[t]) for t in steps]
         paths = {f"path{k}": self._path(t) for k, t in enumerate(steps)}
         verbs = {"is": "would be", "are": "would be", "leaves": "would leave", "faces": "would face"} if would else {}
-        return _WORDS[name].format(*shown, **paths, **{verb: verbs.get(verb, verb) for verb in ("is", "are", "leaves", "faces")})
+        return _WORDS[name].format(*shown, turn=turn, **paths, **{verb: verbs.get(verb, verb) for verb in ("is", "are", "leaves", "faces")})
 
     def _path(self, t: int) -> str:
         """The path of a step of the piece, named by a travel along it, if one is known."""
         pairs = sorted((j - i, abs(i - t), i, j) for i, j in self._courses if t in (i, j) and j == i + 1)
         if not pairs:
-            return f"the path of step {self._piece.steps[t] if t < len(self._piece.steps) else t}"
+            return f"the path of step {self._piece.steps[t]}"
         _, _, i, j = pairs[0]
         return f"the path that steps {self._piece.steps[i]} and {self._piece.steps[j]} define"
 
