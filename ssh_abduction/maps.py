@@ -482,6 +482,8 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     except MemoryError:
         raise MapError(f"{source}: expected a file of maps that fits into memory, got a larger one; list fewer maps (--maps)") from None
     except json.JSONDecodeError as error:
+        if text.startswith(b'{"format": "ssh-trace"'):
+            raise MapError(f"{source}: expected maps, got a trace; name the two files in the other order, or solve it first") from None
         if error.msg == "Extra data":
             mend = "solve prints a line for each of several traces: take one of them"
             raise MapError(f"{source}:{error.lineno}: expected one JSON value, got more after it; {mend}") from None

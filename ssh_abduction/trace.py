@@ -37,6 +37,7 @@ LONGEST_LINE = 16 * 2**20
 SHOWN = 10  # So many steps of a trace are shown in a notebook.
 _KINDS = ("travel", "turn")
 _TURNS = ("right", "left", "around")
+_MAPS = (b'{"format": "ssh-solution"', b'{"format": "ssh-map"')  # what files of maps begin with
 # How files begin that are robots' logs, and no traces.
 _LOGS = {
     b"\x1f\x8b": "gzipped data",
@@ -558,6 +559,10 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
     if where.endswith(":1") and (log := _kind_of_log(raw)):
         raise TraceError(
             f"{where}: header: expected a trace, got {log}, as robots' logs are; make a trace of it with ssh-abduction import LOG -o trace.jsonl"
+        )
+    if where.endswith(":1") and raw.startswith(_MAPS):
+        raise TraceError(
+            f"{where}: header: expected a trace, got maps, as solve prints them; name the two files in the other order, or solve's trace"
         )
     if b"\0" in raw:
         raise TraceError(f"{where}: line: expected text in UTF-8, got a null byte at column {raw.index(0) + 1}; is this a binary file?")

@@ -366,7 +366,8 @@ def test_errors_of_the_shell_are_one_line(machines: tuple[str, str], tmp_path: P
     none.write_text('{"maps": []}')
     for words, message in [
         ([ACES, maps], f"{maps}: maps[0]: labels: expected 23, one for each step of the trace, got 41; solve this trace"),
-        ([maps, trace], "expected"),
+        ([maps, trace], f"{maps}:1: header: expected a trace, got maps"),
+        ([trace, trace], f"{trace}: expected maps, got a trace"),
         ([trace, str(none)], f"{none}: maps: expected one to seek an experiment for, got none"),
         ([trace, maps, "--time-limit", "0"], "--time-limit: expected a number of seconds above 0, got 0.0"),
     ]:

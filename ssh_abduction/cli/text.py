@@ -22,12 +22,13 @@ if TYPE_CHECKING:
 SHOWN_PAIRS = 12
 # So many questions of one choice, and so many ways to answer them, are told of, at most.
 SHOWN_QUESTIONS, SHOWN_OPTIONS = 12, 12
-PLURALS: dict[Matter, str] = {
-    "faults": "faults",
-    "dstates": "dstates",
-    "places": "places",
-    "paths": "paths",
-    "courses": "directions along paths",
+# What differs at one step, and at several.
+NOUNS: dict[Matter, tuple[str, str]] = {
+    "faults": ("fault", "faults"),
+    "dstates": ("dstate", "dstates"),
+    "places": ("place", "places"),
+    "paths": ("path", "paths"),
+    "courses": ("direction along the path", "directions along paths"),
 }
 
 
@@ -152,13 +153,14 @@ def compared(found: Comparison) -> Iterator[str]:
     causes = sum(question.sort in ("faults", "dstates") for question in found.deciding)
     told = "question 1 tells" if len(found.deciding) == 1 else f"questions 1 to {len(found.deciding)}, in this order, tell"
     some = f", and 1 to {causes} the {found.variants['dstates']} labelings" if 0 < causes < len(found.deciding) else ""
-    yield f"  which steps decide: {told} all {counted(len(found.ids), 'maps')} apart{some}"
+    maps = "both maps" if len(found.ids) == 2 else f"all {counted(len(found.ids), 'maps')}"
+    yield f"  which steps decide: {told} {maps} apart{some}"
 
 
 def depending(differing: Mapping[Matter, Sequence[int]]) -> str:
     """The dstates of steps 48 and 51; the paths of step 66."""
     shown = {sort: steps for sort, steps in differing.items() if sort != "courses" or not set(steps) <= set(differing.get("paths", ()))}
-    return "; ".join(f"the {PLURALS[sort]} of {told_steps(steps)}" for sort, steps in shown.items())
+    return "; ".join(f"the {NOUNS[sort][len(steps) > 1]} of {told_steps(steps)}" for sort, steps in shown.items())
 
 
 def _numbered(numbers: Sequence[int], count: int) -> str:

@@ -195,9 +195,12 @@ class Experiment:
         """What is to be kept in mind: that there are more maps, or that a limit ended the search."""
         told = []
         if not self.complete:
-            told.append(
-                f"these {self.count} maps are not known to be all minimal ones, and the experiment says nothing of others; list all (solve -n 0)"
+            known = (
+                f"these {self.count} maps are not known to be all minimal ones"
+                if self.count > 1
+                else "this map is not known to be the only minimal one"
             )
+            told.append(f"{known}, and the experiment says nothing of others; list all (solve -n 0)")
         if self.stopped:
             told.append(f"the search for the experiment was stopped ({self.stopped}), and there may be a better one")
         return "; ".join(told) or None
