@@ -300,7 +300,7 @@ class Trace:
         start, stop, stride = index.indices(len(self))
         if stride != 1:
             raise TraceError(
-                f"steps: expected steps in a row, as each action leads to the next one, got every {stride}th; leave the stride out"
+                f"steps: expected steps in a row, as each action leads to the next one, got a stride of {stride}; leave the stride out"
             )
         if start >= stop:
             raise RangeError(
