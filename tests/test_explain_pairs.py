@@ -249,3 +249,15 @@ def test_keys_are_labels_first() -> None:
     """`compare` reads labels out of the keys of the brute force."""
     (ssh_map,) = solve(RECTANGLE.prefix(5)).maps
     assert key(ssh_map)[0] == ssh_map.labels
+
+
+def test_what_was_interrupted_is_said_so(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The verdict is known by then, and the axioms are not."""
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ssh_abduction.rivals.explain.derive", interrupted)
+    RECTANGLE.prefix(5).save(tmp_path / "rectangle.jsonl")
+    assert main(["explain", str(tmp_path / "rectangle.jsonl"), "0", "4"]) == 130
+    assert capsys.readouterr().out.endswith("different dstates in every map\nwhich axioms it takes was not found out (interrupted)\n")

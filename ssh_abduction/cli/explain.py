@@ -71,6 +71,8 @@ def _exit_code(explanation: PairExplanation | TraceExplanation) -> int:
         no_map, known = explanation.verdict is Verdict.NO_MAP, explanation.proven
     else:
         no_map, known = explanation.possible is False, explanation.possible is not None
+    if explanation.stopped == "interrupted":
+        return interrupted_code()
     if not known or (no_map and explanation.clash is None):
-        return interrupted_code() if explanation.stopped == "interrupted" else EXIT_UNKNOWN
+        return EXIT_UNKNOWN
     return EXIT_NO_MAP if no_map else 0

@@ -168,7 +168,9 @@ class PairExplanation:
         if self.derivation:
             lines.append(str(self.derivation))
         elif self.verdict in (Verdict.DIFFERENT, Verdict.SAME):
-            lines.append("which axioms it takes was not found out: more steps than an argument is sought for, or no time left")
+            lines.append(
+                f"which axioms it takes was not found out ({self.stopped or 'it takes more steps than an argument is sought for'})"
+            )
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
