@@ -106,7 +106,6 @@ def content_of(source: Maps, trace: Trace | None = None, run: Run | None = None,
         "places": _differences(places.items),
         "orders": orders.items,
         "faults": faults.items,
-        "links": _links(maps[0]) if not maps[0].places else [],
         "layouts": drawings,
         "spots": [[round(x, 3), round(y, 3), None if h is None else round(h, 3)] for x, y, h in spots],
         "overview": _overview(maps, spots),
@@ -305,10 +304,6 @@ def _spots(first: SSHMap, found: Layout) -> list[Spot]:
     return spots
 
 
-def _links(ssh_map: SSHMap) -> list[list[Any]]:
-    return [[s, action, x] for s, action, x in ssh_map.links]
-
-
 def _overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
     """All dstates, places and streets that some map has, each with the number of maps that have it. They are the same in two maps where they have the same steps.
 
@@ -338,7 +333,7 @@ def _overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
         for steps in of_place.values():
             places[steps] += count
         pairs: dict[frozenset[Steps], int | None] = {}
-        for a, b in {(ssh_map.dstates[s], ssh_map.dstates[x]) for s, x in set(pairwise(ssh_map.labels))}:
+        for a, b in ((ssh_map.dstates[s], ssh_map.dstates[x]) for s, x in set(pairwise(ssh_map.labels))):
             if a.place is not None and b.place is not None and a.place != b.place and a.path is not None and a.path == b.path:
                 pairs[frozenset((of_place[a.place], of_place[b.place]))] = of_path[a.path]
         if not ssh_map.places:

@@ -82,15 +82,29 @@ function mapOf(i) {
   for (const [path, order] of data.orders[told.orders])
     for (let k = 1; k < order.length; k++)
       if (places.has(order[k - 1]) && places.has(order[k]) && !travelled.has(pairKey(order[k - 1], order[k]))) streets.push({ path, from: order[k - 1], to: order[k], travelled: false });
+  const links = ofPlace.size ? new Map() : linksOf(labels);
   const keys = new Set();
+  for (const [key, link] of links) { link.key = `l${key.split(" ").map((s) => ofDstate.get(Number(s))).join("|")}`; keys.add(link.key); }
   for (const steps of ofDstate.values()) keys.add(`d${steps}`);
   for (const steps of ofPlace.values()) keys.add(`p${steps}`);
   for (const steps of ofPath.values()) keys.add(`h${steps}`);
   for (const street of streets) { street.key = `s${[`${ofPlace.get(street.from)}`, `${ofPlace.get(street.to)}`].sort().join("|")}`; if (street.travelled) keys.add(street.key); }
-  const made = { number: i, labels, dstates, places, ofPlace, ofPath, streets, keys, layout, faults: (told.faults ?? []).map((k) => data.faults[k]), chi2: told.chi2, id: told.id };
+  const made = { number: i, labels, dstates, places, ofPlace, ofPath, streets, links, keys, layout, faults: (told.faults ?? []).map((k) => data.faults[k]), chi2: told.chi2, id: told.id };
   if (decoded.size > 40) decoded.delete(decoded.keys().next().value);
   decoded.set(i, made);
   return made;
+}
+
+// The links of a map without places, by the dstates that they join: which actions of the trace led from the one to the other.
+function linksOf(labels) {
+  const links = new Map(), { steps } = data.replays.at(-1); // the trace that was mapped
+  for (let t = 1; t < labels.length; t++) {
+    const [s, x] = [labels[t - 1], labels[t]], key = `${s} ${x}`;
+    if (s === x) continue;
+    if (!links.has(key)) links.set(key, { from: s, to: x, actions: new Set() });
+    if (steps[t - 1].action !== null) links.get(key).actions.add(steps[t - 1].action);
+  }
+  return links;
 }
 
 function pairKey(a, b) { return a < b ? `${a} ${b}` : `${b} ${a}`; }
@@ -236,11 +250,7 @@ function mapFigure(i, rival) {
   });
   figure.streets = ssh.streets.filter(({ travelled }) => travelled || !other).map(({ path, from, to, key, travelled }) => ({ a: ssh.places.get(from), b: ssh.places.get(to), kind: `${kindOf(key, path)}${travelled ? "" : " order"}`.trim(), colour: other ? null : path % COLOURS, path,
     title: `path ${path}, from place ${from} to place ${to}${travelled ? "" : ": only the order of the path says so, nobody travelled there"}` }));
-  if (!ssh.places.size && data.maps[i].labeling === data.maps[0].labeling) {
-    const links = new Map();
-    for (const [s, action, x] of data.links) if (s !== x) { const key = pairKey(s, x); links.set(key, [...(links.get(key) ?? []), `${action}: ${s} → ${x}`]); }
-    for (const [key, names] of links) { const [s, x] = key.split(" ").map(Number); figure.streets.push({ a: ssh.dstates[s].at, b: ssh.dstates[x].at, kind: "", title: names.join("; ") }); }
-  }
+  for (const { from, to, actions, key } of ssh.links.values()) figure.streets.push({ a: ssh.dstates[from].at, b: ssh.dstates[to].at, kind: kindOf(key, null), headed: true, names: [...actions].join(", "), title: `${[...actions].join(", ") || "an action"}: from dstate ${from} to dstate ${to}` });
   figure.faults = ssh.faults.map(([step, text]) => ({ step, title: text }));
   figure.points = [...ssh.places.values(), ...ssh.dstates.filter((s) => s.place === null).map((s) => s.at)];
   figure.layout = ssh.layout;
@@ -301,7 +311,8 @@ function paintFigure(figure) {
   });
   paintMarks(figure, see, r);
   const named = new Set();
-  for (const m of figure.marks) if (m.name && (apart > 60 || (m.bare && apart > 24))) label(figure, m.name, [m.x, m.y], m.size + 2, around(m));
+  for (const m of figure.marks) if (m.name && apart > (figure.marks.length > 150 ? 70 : m.bare ? 24 : 40)) label(figure, m.name, [m.x, m.y], m.size + 2, around(m));
+  for (const street of figure.streets) if (street.names && apart > 60) { const [x, y, c, s] = street.middle; label(figure, street.names.length > 24 ? `${street.names.slice(0, 23)}…` : street.names, [x, y], 3, [[c, s], [-c, -s]], "soft"); }
   for (const street of figure.streets) if (street.path !== undefined && !named.has(street.path)) {
     const [[ax, ay], [bx, by]] = [see(street.a), see(street.b)], far = Math.hypot(bx - ax, by - ay) || 1, [nx, ny] = [-(by - ay) / far, (bx - ax) / far];
     if (far > 60 && [0.5, 0.35, 0.65].some((part) => label(figure, `path ${street.path}`, [ax + (bx - ax) * part, ay + (by - ay) * part], 6, [[nx, ny], [-nx, -ny]], "path"))) named.add(street.path);
@@ -314,14 +325,20 @@ function paintFigure(figure) {
 function paintStreet(figure, street, a, b, spots, r) {
   const far = Math.hypot(b[0] - a[0], b[1] - a[1]) || 1, [ux, uy] = [(b[0] - a[0]) / far, (b[1] - a[1]) / far];
   let met = 0;
-  for (const [x, y] of spots) {
+  if (!street.headed) for (const [x, y] of spots) {
     const along = (x - a[0]) * ux + (y - a[1]) * uy, aside = (y - a[1]) * ux - (x - a[0]) * uy;
     if (along > r && along < far - r && Math.abs(aside) < r + 2 && Math.hypot(x - a[0], y - a[1]) > 1 && Math.hypot(x - b[0], y - b[1]) > 1) met += aside > 0 ? -1 : 1.5;
   }
-  const bend = met ? Math.sign(met) * Math.min(0.4 * far, 4.5 * r + 0.05 * far) : 0;
+  const bend = street.headed ? Math.min(0.2 * far, 34) : met ? Math.sign(met) * Math.min(0.4 * far, 4.5 * r + 0.05 * far) : 0;
   const way = bend ? `M${a[0].toFixed(1)},${a[1].toFixed(1)} Q${((a[0] + b[0]) / 2 - uy * bend).toFixed(1)},${((a[1] + b[1]) / 2 + ux * bend).toFixed(1)} ${b[0].toFixed(1)},${b[1].toFixed(1)}` : `M${a[0].toFixed(1)},${a[1].toFixed(1)} L${b[0].toFixed(1)},${b[1].toFixed(1)}`;
-  const drawn = element("svg:path", { d: way, class: classes("street", street.kind, coloured(street.colour)), "stroke-width": (street.kind.includes("order") ? 1.5 : Math.min(5, Math.max(1.5, 0.4 * r))).toFixed(1) }, null, figure.base);
+  if (street.headed) { // an arrow before the dstate that the link leads to, and its actions beside its middle
+    const [mx, my] = [(a[0] + b[0]) / 2 - uy * bend, (a[1] + b[1]) / 2 + ux * bend], away = Math.hypot(b[0] - mx, b[1] - my) || 1, [c, s] = [(b[0] - mx) / away, (b[1] - my) / away];
+    street.head = [b[0] - c * (r + 6), b[1] - s * (r + 6), c, s];
+    street.middle = [(a[0] + b[0]) / 2 - (uy * bend) / 2, (a[1] + b[1]) / 2 + (ux * bend) / 2, -uy, ux];
+  }
+  const drawn = element("svg:path", { d: way, class: classes("street", street.kind, coloured(street.colour)), "stroke-width": (street.kind.includes("order") || street.headed ? 1.5 : Math.min(5, Math.max(1.5, 0.4 * r))).toFixed(1) }, null, figure.base);
   element("svg:title", {}, street.title, drawn);
+  if (street.headed) element("svg:path", { d: arrowAt(...street.head, 6), class: classes("head", street.kind) }, null, figure.base);
   if (street.inner) element("svg:path", { d: way, class: classes("street", street.inner, "inner"), "stroke-width": Math.min(2.5, Math.max(1, 0.2 * r)).toFixed(1) }, null, figure.base);
 }
 
@@ -722,7 +739,7 @@ async function ask(question, body) {
 async function why() {
   const pair = state.picked;
   if (pair.length < 2) return;
-  if (!served) { $("answer").textContent = `ssh-abduction explain ${data.trace} ${pair[0]} ${pair[1]}${data.flags}${theory()}`; return; }
+  if (!served) { $("answer").className = "command"; $("answer").textContent = `ssh-abduction explain ${data.trace} ${pair[0]} ${pair[1]}${data.flags}${theory()}`; return; }
   const told = await ask("explain", { pair, ...assumed });
   if (!told) return;
   $("answer").textContent = told.text;
@@ -735,6 +752,7 @@ async function assume(kind) {
   if (!served) {
     if (kind) assumed[kind].push(pair); else { assumed.same = []; assumed.different = []; }
     $("forget").hidden = !theory();
+    $("answer").className = "command";
     $("answer").textContent = theory() ? `ssh-abduction solve ${data.trace} --json${data.flags}${theory()} > assumed.json\nssh-abduction view assumed.json ${data.trace}\n\nOr let this page solve again:\nssh-abduction view ${data.file} ${data.trace} --serve` : "";
     return;
   }
