@@ -94,3 +94,10 @@ def test_style_sheets_that_load_from_elsewhere_are_found(tmp_path: Path) -> None
         "s.css: loads https://x.example/a.css from elsewhere",
         "s.css: loads no.png, which is no file of the site",
     ]
+
+
+def test_each_page_is_once_in_the_navigation() -> None:
+    listed = re.findall(r"^ +- (?:.*: )?([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    made = {"index.md", "reference/index.md"}
+    pages = {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
+    assert sorted(listed) == sorted(pages | made)
