@@ -147,6 +147,11 @@ def test_the_command_line_knows_all_that_is_shown() -> None:
         assert parser().parse_args(words[1:]), line
 
 
+def test_the_usage_page_begins_with_all_commands() -> None:
+    table = (ROOT / "docs" / "usage.md").read_text().partition("## One trace")[0]
+    assert set(re.findall(r"`([a-z-]+)`[,|]", table.replace("` |", "`|"))) == set(parser().verbs)
+
+
 def test_the_trace_of_the_formats_page_has_a_map(tmp_path: Path) -> None:
     written = tmp_path / "trace.jsonl"
     written.write_text((ROOT / "docs" / "formats.md").read_text().split("```")[1].lstrip())
