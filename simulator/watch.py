@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -17,7 +17,7 @@ from simulator.control import TURNS, Driver
 from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.laser import meetings
 from simulator.motion import Pose, between
-from simulator.world import TrueDState, World, are_square
+from simulator.world import World, are_square
 
 # Metres, and radians, by which a robot may be off the place where it is to be; `reach` metres, if that is more.
 NEAR, FACING = 0.5, math.radians(45)
@@ -57,10 +57,11 @@ class Watch:
             raise SimulatorError(f"{error} ({where}){self._because(before)}") from None
         after = self.driver.robot.pose
         expected = self._expected(name, before)
-        if expected and not self._is_at(expected, after):
+        if expected and self._is_elsewhere(expected, after):
+            at = self.world.places[expected]
             raise SimulatorError(
-                f"{self.world.name}: {where}: expected the robot to come to {_at(expected.place, expected.pose)}, got it {_at('', after)}, "
-                f"{math.dist(expected.pose[:2], after[:2]):.1f} m off; so it drives another route than it was told{self._because(before)}"
+                f"{self.world.name}: {where}: expected the robot to come to {_at(expected, at)}, got it {_at('', after)}, "
+                f"{math.dist(at, after[:2]):.1f} m off; so it drives another route than it was told{self._because(before)}"
             )
         if place == len(self.world.route) - 1:
             self._ended(tour, after)
@@ -80,21 +81,28 @@ class Watch:
     def _near(self) -> float:
         return max(NEAR, self.world.reach)
 
-    def _is_at(self, state: TrueDState, pose: Pose) -> bool:
-        found = self.world.nearest(pose)
-        return found is not None and found.place == state.place and math.dist(pose[:2], state.pose[:2]) <= 2 * self._near
+    def _is_elsewhere(self, place: str, pose: Pose) -> bool:
+        """Whether a robot is nearer to another place, or far from all."""
+        far = {name: math.dist(at, pose[:2]) for name, at in self.world.places.items()}
+        return far[place] > min(2 * self._near, *far.values())
 
-    def _expected(self, action: str, pose: Pose) -> TrueDState | None:
-        """The dstate at whose place an action is to end, from a pose; None where the world does not say."""
+    def _expected(self, action: str, pose: Pose) -> str | None:
+        """The place at which an action is to end, from a pose; None where the world does not say."""
         here = self.world.nearest(pose)
-        if here is None or action in TURNS:
-            return here
+        if (
+            here is None
+            or math.dist(here.pose[:2], pose[:2]) > self._near
+            or abs(math.remainder(here.pose[2] - pose[2], math.tau)) > FACING
+        ):
+            return None
+        if action in TURNS:
+            return here.place
         ahead = []
         for state in self.world.dstates:
             x, y, _ = between(here.pose, state.pose)
             if (state.path, state.direction) == (here.path, here.direction) and x > NEAR and abs(y) <= STRAIGHT * x:
-                ahead.append((x, state.name, state))
-        return min(ahead)[2] if ahead else None
+                ahead.append((x, state.place))
+        return min(ahead)[1] if ahead else None
 
     def _because(self, before: Pose | None = None) -> str:
         """The likely causes, as the end of a message; nothing where none is known. `before` is where the action began."""
@@ -141,7 +149,7 @@ def _off_axis(world: World) -> float:
     return abs(math.remainder(world.start[2] - math.atan2(longest[1], longest[0]), math.pi / 2))
 
 
-def _at(what: str, pose: Pose) -> str:
+def _at(what: str, pose: Sequence[float]) -> str:
     return f"{what} at ({pose[0]:.2f}, {pose[1]:.2f})".lstrip()
 
 

@@ -106,7 +106,7 @@ def test_a_closed_pipe_and_a_ring_of_links_are_errors(tmp_path: Path, capsys: py
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
     for place in (tmp_path / "a", tmp_path, tmp_path / "none" / "x"):
-        assert main(["simulate", "notched-rectangle", "--route", "right", "-o", str(place)]) == 1
+        assert main(["simulate", "notched-rectangle", "--route", "around,around", "-o", str(place)]) == 1
         err = capsys.readouterr().err
         assert err.startswith(f"ssh-abduction: {place}: cannot write the trace: ")
         assert err.count("\n") == 1
@@ -140,7 +140,7 @@ def test_every_verb_that_writes_writes_into_a_pipe(tmp_path: Path, capsys: pytes
     maps = tmp_path / "maps.json"
     maps.write_text(capsys.readouterr().out)
     for words in (
-        ["simulate", "notched-rectangle", "--route", "right", "-o"],
+        ["simulate", "notched-rectangle", "--route", "around,around", "-o"],
         ["cluster", str(run), "--k", "4", "-o"],
         ["train", str(views), str(maps), "-o"],
         ["learning-curve", str(views), str(maps), "--map", "1", "--folds", "2", "--plot"],
@@ -303,7 +303,7 @@ def test_ctrl_c_while_modules_load_is_quiet(program: str, module: str, tmp_path:
     (tmp_path / "sitecustomize.py").write_text(CTRL_C_AT.format(module=module))
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
     words = [word.replace("~", " ") for word in program.split(" ")]
-    command = [sys.executable, *words, "simulate", "notched-rectangle", "--route", "right", "-o", str(tmp_path / "out")]
+    command = [sys.executable, *words, "simulate", "notched-rectangle", "--route", "around,around", "-o", str(tmp_path / "out")]
     if module.startswith("sklearn"):
         command[-6:] = ["recognise", str(tmp_path / "none"), ACES]
     done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=False)
@@ -323,7 +323,7 @@ def test_what_would_steer_a_terminal_is_escaped(tmp_path: Path, capsys: pytest.C
         *(["solve", str(trace)], ["solve", str(trace), str(trace)], ["check", str(trace), str(maps)], ["check", ACES, str(maps)]),
         *(["show", str(maps)], ["show", str(maps), "--dot"], ["show", str(maps), "--svg"], ["show", str(maps), "--graphml"]),
         *(["solve", str(missing)], ["show", str(missing)], ["recognise", str(missing), ACES], ["simulate", f"{missing}.json", "-o", "x"]),
-        *(["cluster", str(trace), "-o", str(missing)], ["simulate", "notched-rectangle", "--route", "right", "-o", str(missing)]),
+        *(["cluster", str(trace), "-o", str(missing)], ["simulate", "notched-rectangle", "--route", "around,around", "-o", str(missing)]),
     ):
         main(words)
         captured = capsys.readouterr()
