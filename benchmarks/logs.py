@@ -2,7 +2,7 @@
 
     python benchmarks/logs.py [LOG ...] [--plans FOLDER] --out rows.jsonl [--runs FOLDER] [--page docs/logs.md]
 
-With --plans a robot is simulated in each floor plan of a folder, a drive for each seed, and its logs are mapped like others. Each log is mapped by `ssh-abduction map`, and its events and the first of its maps are judged; then by the skeleton of a grid of its scans at their corrected poses, which a robot does not have, and by that of a grid at the
+With --plans a robot is simulated in each floor plan of a folder, a drive for each seed, and its logs are mapped like others. Each log is mapped by `ssh-abduction map`, and its events and the first of its maps are judged; then by the skeleton of a grid of its scans at their corrected poses, which a robot does not have, without and with nodes at doors, and by that of a grid at the
 poses of its odometry, which is what a robot has that maps nothing. A log NAME.log with NAME.truth.json beside it is a simulated one, and judged by that. Rows that are in the file of rows already are not made again.
 """
 
@@ -29,7 +29,10 @@ from perception.readers.logs import read_log
 from ssh_abduction import Trace
 from ssh_abduction.maps import maps_of, read_json
 
-METHODS = ("ssh-abduction", "skeleton, corrected poses", "skeleton, odometry")
+OURS = "ssh-abduction"
+# By name the poses at which scans are laid into the grid, and whether doors are nodes.
+SKELETONS = {"skeleton": ("corrected", False), "skeleton with doors": ("corrected", True), "skeleton, odometry": ("odometry", False)}
+METHODS = (OURS, *SKELETONS)
 HEAD = (
     "| log | mapper | places | events | events: precision, recall | passes noticed | accuracy | edges: precision, recall | pairs: joined, returns | pairs: precision, recall | CPU s |",
     "|---|---|---|---|---|---|---|---|---|---|---|",
@@ -61,10 +64,10 @@ def driven(plans: Path, seeds: int, runs: Path) -> Iterator[Path]:
         yield log
 
 
-def by_skeleton(log: Path, kind: str) -> Events:
+def by_skeleton(log: Path, kind: str, doors: bool) -> Events:
     read = read_log(str(log))
     poses = poses_of(read, kind)
-    passed = skeleton_of(read, poses).events(poses)
+    passed = skeleton_of(read, poses, doors=doors).events(poses)
     return Events(tuple(scan for scan, _ in passed), tuple(node for _, node in passed))
 
 
@@ -83,7 +86,7 @@ def row_of(log: Path, method: str, truth: Truth, runs: Path) -> dict[str, Any]:
     row = {"log": name_of(log), "method": method, "simulated": sidecar(log) is not None}
     began = process_time()
     try:
-        events = by_map(log, runs) if method == METHODS[0] else by_skeleton(log, "corrected" if "corrected" in method else "odometry")
+        events = by_map(log, runs) if method == OURS else by_skeleton(log, *SKELETONS[method])
     except subprocess.CalledProcessError as error:
         return row | {"failed": error.stderr.decode(errors="replace").strip().rpartition("\n")[2]}
     except (OSError, ValueError) as error:
@@ -110,7 +113,7 @@ def lines_of(row: dict[str, Any]) -> Iterator[str]:
         f"{noticed} of {come}",
     ]
     cells += [shown(row["accuracy"]), shown(row["edge_precision"], row["edge_recall"]), f"{pairs['joined']}, {pairs['returns']}"]
-    cells += [shown(pairs["precision"], pairs["recall"]), "–" if row["method"] == METHODS[0] else f"{row['seconds']:.1f}"]
+    cells += [shown(pairs["precision"], pairs["recall"]), "–" if row["method"] == OURS else f"{row['seconds']:.1f}"]
     yield "| " + " | ".join(map(str, cells)) + " |"
     if (pairs := row.get("relations")) is not None:
         yield f"| by relations | {row['method']} | | | | | | | {pairs['joined']}, {pairs['returns']} | {shown(pairs['precision'], pairs['recall'])} | |"

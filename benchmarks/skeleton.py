@@ -1,10 +1,10 @@
 """What people use for topological maps of metric ones: the skeleton of the free space of an occupancy grid, pruned, as a graph.
 
-    python benchmarks/skeleton.py LOG [LOG ...] -o FOLDER [--poses corrected|odometry]
+    python benchmarks/skeleton.py LOG [LOG ...] -o FOLDER [--poses corrected|odometry] [--doors]
 
 draws for each log the grid, the graph and the way of the robot. All scans are laid into the grid at their poses: at the corrected ones, which the robot did not have, or at those of the odometry. The skeleton (Zhang & Suen 1984,
 scikit-image) of the cells where a robot fits has branches to every niche; one that ends within the circle around its junction that touches the nearest wall, or hardly beyond it, is cut off, as is usual (Thrun 1998, "Learning metric-topological maps";
-Shaked & Bruckstein 1998, "Pruning medial axes"). Junctions in one open space, nearer to each other than to the walls, are one node. Nodes are junctions, dead ends and doors. All lengths are in metres, and the same for all logs.
+Shaked & Bruckstein 1998, "Pruning medial axes"). Junctions in one open space, nearer to each other than to the walls, are one node. Nodes are junctions and dead ends, and with --doors also doors. All lengths are in metres, and the same for all logs.
 """
 
 from __future__ import annotations
@@ -145,8 +145,8 @@ class Skeleton:
         return [(scan, nodes[number]) for scan, number in passed]
 
 
-def skeleton_of(log: RobotLog, poses: Sequence[Pose]) -> Skeleton:
-    """The pruned skeleton of the free space that a log shows at these poses."""
+def skeleton_of(log: RobotLog, poses: Sequence[Pose], *, doors: bool = False) -> Skeleton:
+    """The pruned skeleton of the free space that a log shows at these poses; with nodes at doors, too, where these are asked for."""
     from skimage.morphology import skeletonize
 
     grid = grid_of(log, poses)
@@ -155,7 +155,9 @@ def skeleton_of(log: RobotLog, poses: Sequence[Pose]) -> Skeleton:
     for node, data in graph.nodes(data=True):
         data["clear"] = float(clear[node])
     _prune(graph)
-    graph = _with_doors(_merged(graph), clear)
+    graph = _merged(graph)
+    if doors:
+        graph = _with_doors(graph, clear)
     for _, data in graph.nodes(data=True):
         data["at"] = grid.points(np.array([data["cell"]]))[0]
     for *_, data in graph.edges(data=True):
@@ -312,12 +314,13 @@ def main() -> None:
     parser.add_argument("logs", nargs="+", metavar="LOG")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--poses", choices=("corrected", "odometry"), default="corrected")
+    parser.add_argument("--doors", action="store_true", help="have nodes at doors, too")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     for name in options.logs:
         log = read_log(name)
         poses = poses_of(log, options.poses)
-        skeleton = skeleton_of(log, poses)
+        skeleton = skeleton_of(log, poses, doors=options.doors)
         events = skeleton.events(poses)
         text = f"{Path(name).name.partition('.')[0]}: {len(skeleton.graph)} nodes, {len({node for _, node in events})} of them passed, {len(events)} times"
         draw(options.output / f"{Path(name).name.partition('.')[0]}.png", skeleton, poses, text)
