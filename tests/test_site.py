@@ -55,6 +55,10 @@ def test_links_out_of_the_pages_lead_to_github(link: str, shown: str) -> None:
     assert hooks.to_github("[up](../usage.md)", "tutorials/logs.md") == "[up](../usage.md)"
 
 
+def test_links_that_are_called_as_a_file_have_its_title() -> None:
+    assert hooks.with_titles("as [theory.md](theory.md#faults) says") == "as [The theory](theory.md#faults) says"
+
+
 def test_all_names_that_pages_import_have_a_page() -> None:
     imported = set()
     for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
