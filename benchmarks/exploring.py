@@ -65,7 +65,7 @@ class World(Protocol):
 class Maze:
     """A maze of corridors, of so many cells each way. A dstate is a cell and a heading, a view the openings ahead, right, back and left. The robot turns to any side."""
 
-    theory, margin = Theory.topological(), 2
+    theory, margin = Theory.topological(), 4
 
     def __init__(self, cells: int, seed: int) -> None:
         chance = random.Random(seed)
@@ -209,16 +209,24 @@ def steps_to_map(robot: Driven, limit: float) -> int | None:
     return high
 
 
-def explorer(world: World, seed: int, most: int, limit: float) -> Record:
-    robot = Driven(world)
+def explorer(world: World, seed: int, most: int, limit: float, seconds: float = float("inf"), judged: bool = False) -> Record:
+    """Until it says that it ends; until so many seconds of processor time are spent; or, if it is judged as it drives, until it has the map."""
+    robot, missing = Driven(world), everything(states_of(world))
     found = Explorer(robot, world.theory, margin=world.margin, limit=limit)
-    began = time.perf_counter()
-    while len(robot.done) < most and found.step():
-        pass
-    spent = time.perf_counter() - began
+    began = time.process_time()
+    goes_on = True
+    while goes_on and len(robot.done) < most and time.process_time() - began < seconds:
+        goes_on = found.step()
+        missing -= {*robot.truth[-2:]} | {(state, action.name) for state, action in zip(robot.truth[-2:], robot.done[-1:], strict=False)}
+        if judged and not missing and has_map(robot, len(robot.done), 10 * limit):
+            break
+    spent = {"driven": len(robot.done), "seconds": round(time.process_time() - began, 1)}
+    steps = steps_to_map(robot, 10 * limit)
+    if goes_on:
+        return {"steps": steps, **spent}
     ending = found.result.ending
     told = {"stopped": len(robot.done), "ending": ending, "done": ending == "done", "true": has_map(robot, len(robot.done), 10 * limit)}
-    return {"steps": steps_to_map(robot, limit), **told, "seconds": round(spent, 1)}
+    return {"steps": steps, **told, **spent}
 
 
 def random_walk(world: World, seed: int, most: int, limit: float) -> Record:
@@ -311,7 +319,7 @@ class TooLongError(Exception):
     """So many steps were done that the run is given up."""
 
 
-RUN: dict[str, Callable[[World, int, int, float], Record]] = {"explorer": explorer, "random": random_walk, "rule": rule, "hW": learnt}
+RUN: dict[str, Callable[..., Record]] = {"explorer": explorer, "random": random_walk, "rule": rule, "hW": learnt}
 
 
 def worlds(options: argparse.Namespace) -> Iterator[tuple[World, int]]:
@@ -412,6 +420,10 @@ def main() -> None:
     parser.add_argument("--most", type=int, default=20_000, metavar="N", help="give up after so many steps (default 20000); explorer 2000")
     parser.add_argument("--limit", type=float, default=3.0, metavar="S", help="seconds for a solve, about (default 3)")
     parser.add_argument(
+        "--seconds", type=float, default=float("inf"), metavar="S", help="of processor time for a run of the explorer (default: no limit)"
+    )
+    parser.add_argument("--judged", action="store_true", help="end a run of the explorer once it has the true map, before it says so")
+    parser.add_argument(
         "--out", type=Path, metavar="RESULTS.jsonl", help="where to store what came of each run; what is there is not run again"
     )
     parser.add_argument("--table", type=Path, metavar="RESULTS.jsonl", help="print a table of stored results instead")
@@ -432,7 +444,8 @@ def main() -> None:
             if (world.name, strategy) in known:
                 continue
             most = min(options.most, 2000) if strategy == "explorer" else options.most
-            said = RUN[strategy](world, seed, most, options.limit)
+            told = {"seconds": options.seconds, "judged": options.judged} if strategy == "explorer" else {}
+            said = RUN[strategy](world, seed, most, options.limit, **told)
             record = {"family": family, "world": world.name, "dstates": len(states_of(world)), "strategy": strategy, **said}
             print(json.dumps(record), flush=True)
             if options.out:

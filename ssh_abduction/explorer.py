@@ -2,7 +2,12 @@
 
     see  ->  minimal maps of all that was seen  ->  next experiment  ->  do its actions  ->  see …
 
-The maps are kept by `OnlineMapper`. A new experiment is sought when the last one is done, and when clingo was asked or rivals were refuted.
+The maps are kept by `OnlineMapper`. A new experiment is sought when the last one is done, and when clingo was asked or rivals were refuted:
+
+1. Where known links tell minimal maps apart, the actions that do (explore.py).
+2. Else the shortest tour through all that is untried in the first of them (tour.py), which looks around where it comes back to and not at once.
+3. Else what minimal maps say something different of.
+4. Else what tells the map from one in which a return is none.
 
 When it is done
 ---------------
@@ -12,7 +17,10 @@ When it is done
    by the causal theory, the two steps are not one dstate, is a rival too if it has up to `margin` dstates more. An experiment tells it from the minimal map, and then the doubt is weighed again. What such a map
    costs at least can only grow with the trace, so a doubt that was dispelled stays so until the minimal maps themselves have more dstates.
 
-That is no proof that the map is true, as nothing is: a world may hide more dstates than `margin`. How often it is true is measured (docs/exploring.md).
+Where no experiment tells such a rival from the minimal map, either both are the same map from here on, and differ in where the robot was at first: that is no doubt. Or the rival is another map, as closed as the minimal
+one, which predicts the same for ever: a symmetric world has such maps. Then the exploration ends as `inseparable`, and not as `done`.
+
+That is no proof that the map is true, as nothing is: a world may hide more dstates than `margin`, and of the rivals that deny a return only the best is looked at. How often it is true is measured (docs/exploring.md).
 """
 
 from __future__ import annotations
@@ -28,6 +36,7 @@ from ssh_abduction.maps import SSHMap
 from ssh_abduction.online.mapper import OnlineMapper
 from ssh_abduction.rivals.explore import Experiment, next_experiment
 from ssh_abduction.rivals.machines import Seen
+from ssh_abduction.rivals.tour import next_tour
 from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
@@ -36,6 +45,9 @@ from ssh_abduction.words import counted
 
 # Where nothing is left to do, but the map is not proven minimal, so many times the limit of a step are spent on it.
 LONGER = 5
+
+# Dstates that a place may show, and still be another one than the map takes it for, as a robot drives on: as many as places with four sides have.
+DOUBTED = 4
 
 Doubt: TypeAlias = tuple[int, int]  # two steps, which are at one place in the map, or at one dstate
 Ending: TypeAlias = Literal["done", "inseparable", "steps", "time", "contradicted"]
@@ -66,11 +78,12 @@ class Exploration:
     """What an explorer has found out.
 
     steps      how many actions were done
-    ending     why it ended. done: one map is left, nothing in it is untried, and no return is in doubt; inseparable: nothing that the robot can do tells the rivals apart that are left; steps: the steps that it
+    ending     why it ended. done: one map is left, nothing in it is untried, and no return is in doubt; inseparable: nothing that the robot can do tells the rivals apart that are left, or the minimal map from `rival`; steps: the steps that it
                was given are spent; time: there was no time to prove which maps are minimal, or to weigh a doubt; contradicted: no map explains what was seen
     is_unique  whether all minimal maps have the same dstates, and the same places: they differ in paths at most
     is_true    whether it is unique and true, as far as it was driven: its dstates and places are those that the robot's looks tell as truth. None where they tell none
     solution   the minimal maps of all that was seen
+    rival      a map with more dstates that explains all, too, is closed, and predicts the same for ever, if one was found: then the minimal map may be unique, and the world a larger one
     """
 
     steps: int
@@ -78,15 +91,21 @@ class Exploration:
     is_unique: bool
     is_true: bool | None
     solution: Solution
+    rival: SSHMap | None = None
 
     @property
     def sentence(self) -> str:
         """What came of it, in a few words."""
         truth = {None: "", True: ", and true", False: ", and not true"}[self.is_true] if self.is_unique else ""
-        return f"after {counted(self.steps, 'steps')} the map is {'' if self.is_unique else 'not '}unique{truth}: {_ENDINGS[self.ending]}"
+        why = _ENDINGS[self.ending]
+        if self.is_unique and self.rival:
+            more = len(self.rival.dstates) - len(self.solution.maps[0].dstates)
+            why = f"a map with {counted(more, 'dstates')} more explains all, too, and nothing that the robot can do tells them apart"
+        return f"after {counted(self.steps, 'steps')} the map is {'' if self.is_unique else 'not '}unique{truth}: {why}"
 
     def to_dict(self) -> dict[str, Any]:
         told = {name: getattr(self, name) for name in ("steps", "ending", "is_unique", "is_true")}
+        told["rival"] = self.rival.to_dict() if self.rival else None
         return {**told, "summary": self.sentence, "solution": self.solution.to_dict()}
 
 
@@ -133,6 +152,7 @@ class Explorer:
         self._plan: list[str] = []
         self._least: dict[Doubt, int] = {}  # how many dstates a map has at least in which two steps are not where the map says
         self._undecided: set[Doubt] = set()  # doubts of which nothing was found out in time
+        self._twins: dict[Doubt, SSHMap] = {}  # rivals with few dstates more that nothing tells apart from the minimal map
         self._stuck = False  # nothing was left to do when it was last asked
         self._note(first)
 
@@ -175,6 +195,9 @@ class Explorer:
         self._note(seen)
         if self.mapper.searches > asked or self.mapper.solution.count != known:
             self._plan = []
+            for doubt in (*self._twins, *self._undecided):
+                self._least.pop(doubt, None)
+            self._twins, self._undecided = {}, set()
         self._longer = None
         return True
 
@@ -183,7 +206,8 @@ class Explorer:
         """What was found out so far."""
         solution = self.solution
         unique = _is_unique(solution)
-        return Exploration(len(self.trace) - 1, self._ending(unique), unique, self._is_true(unique), solution)
+        rival = next(iter(self._twins.values()), None)
+        return Exploration(len(self.trace) - 1, self._ending(unique), unique, self._is_true(unique), solution, rival)
 
     def _ending(self, unique: bool) -> Ending:
         if self.solution.status is Status.UNSATISFIABLE:
@@ -192,6 +216,8 @@ class Explorer:
             return "steps"
         if self.solution.status is not Status.OPTIMAL or self._undecided:
             return "time"
+        if self._twins:
+            return "inseparable"
         return "done" if unique else "inseparable" if self.solution.complete else "time"
 
     def _is_true(self, unique: bool) -> bool | None:
@@ -228,7 +254,10 @@ class Explorer:
 
     def _next_plan(self) -> tuple[str, ...]:
         """The actions of the next experiment: between minimal maps, or with what is untried; else with a return that is in doubt."""
-        found = self._experiment(list(self.solution.maps))
+        maps = list(self.solution.maps)
+        found = self._experiment(maps)
+        if not found.plan.branches and (tour := self._tour(maps[0])):
+            return tour
         if not found.actions and not (self.solution.status is Status.OPTIMAL and self.solution.complete):
             longer = None if self._limit is None else LONGER * self._limit
             self._longer = solve(self.mapper.trace, self.mapper.theory, limit=longer, maps=self._most)
@@ -239,14 +268,25 @@ class Explorer:
         best = self.solution.maps[0]
         for doubt in self._doubts(best):
             for rival in self._without(doubt, len(best.dstates)):
-                if actions := self._experiment([best, rival]).actions:
-                    return actions
-                self._least[doubt] = len(best.dstates) + self._margin + 1  # nothing tells the two apart
+                experiment = self._experiment([best, rival])
+                if experiment.actions:
+                    return experiment.actions
+                if len(experiment.alike) > 1:
+                    self._twins[doubt] = rival
+                self._least[doubt] = (
+                    len(best.dstates) + self._margin + 1
+                )  # from here on the two are one map, which differ in the past, or nothing tells them apart
         return ()
 
     def _experiment(self, maps: list[SSHMap]) -> Experiment:
         return next_experiment(
             maps, self.mapper.trace, theory=self.mapper.theory, actions=self._actions.values(), can=self._can, implied=True
+        )
+
+    def _tour(self, ssh_map: SSHMap) -> tuple[str, ...]:
+        """The actions that lead soonest through all that is untried in a map."""
+        return next_tour(
+            ssh_map, self.mapper.trace, theory=self.mapper.theory, actions=self._actions.values(), can=self._can, margin=DOUBTED
         )
 
     def _doubts(self, ssh_map: SSHMap) -> Iterator[Doubt]:

@@ -71,12 +71,12 @@ def partition(names: Collection[Any]) -> list[int]:
 
 @pytest.mark.parametrize(
     ("world", "start", "margin"),
-    [(CORRIDOR, "a", 1), (TEE, "W", 2), (PLUS, "W", 0), (RING, "a", 0)],
+    [(CORRIDOR, "a", 1), (TEE, "W", 1), (PLUS, "W", 0), (RING, "a", 0)],
     ids=["corridor", "tee", "plus", "ring"],
 )
 def test_streets_are_known_when_it_is_done(world: Streets, start: str, margin: int) -> None:
     robot = Streetwalker(world, start, "E")
-    found = Explorer(robot, margin=margin).explore(200)
+    found = Explorer(robot, margin=margin, limit=None).explore(200)
     assert (found.ending, found.is_unique, found.is_true) == ("done", True, True)
     assert found.steps == len(robot.done)
     assert set(robot.been) == {(place, heading) for place in world for heading in range(4)}
@@ -134,6 +134,15 @@ def test_a_margin_finds_what_the_fewest_dstates_hide() -> None:
     assert {margin: (said.ending, said.is_true) for margin, said in found.items()} == {0: ("done", False), 2: ("done", True)}
     assert found[0].steps == 2  # after a, b, b it takes the last two for one
     assert found[2].steps >= 4
+
+
+def test_a_rival_with_more_dstates_that_nothing_tells_apart_is_said() -> None:
+    found = Explorer(Machine("abab", {s: {"on": (s + 1) % 4} for s in range(4)}), Theory.causal(), limit=None).explore(50)
+    assert (found.ending, found.is_unique, found.is_true) == ("inseparable", True, False)
+    assert found.rival is not None
+    assert (len(found.solution.maps[0].dstates), len(found.rival.dstates)) == (2, 4)
+    assert "a map with 2 dstates more explains all, too" in found.sentence
+    assert found.to_dict()["rival"]["labels"] == list(found.rival.labels)
 
 
 class Crooked(Streetwalker):

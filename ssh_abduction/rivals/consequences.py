@@ -20,8 +20,8 @@ from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Action
 
 How: TypeAlias = Literal["link", "implied", "expected", "open"]
-_QUARTERS = {"right": 1, "around": 2, "left": 3}
-_OF_FRAMES = frozenset({"turn_rotates", "one_dstate_per_heading", "one_heading"})
+QUARTERS = {"right": 1, "around": 2, "left": 3}
+OF_FRAMES = frozenset({"turn_rotates", "one_dstate_per_heading", "one_heading"})
 _OF_COURSES = frozenset({"turn_around_reverses", "one_dstate_per_course"})
 
 
@@ -69,7 +69,7 @@ class Consequences:
     def __init__(self, ssh_map: SSHMap, links: dict[int, dict[str, int]], looks: Sequence[Seen], theory: Theory | None) -> None:
         self._dstates, self._links, self._looks = ssh_map.dstates, links, looks
         headed = [s for s in ssh_map.dstates if s.heading is not None and s.place is not None]
-        has_frames = all((s.heading or 0) < 4 for s in headed) if theory is None else theory.star == "frame" and theory.hard >= _OF_FRAMES
+        has_frames = all((s.heading or 0) < 4 for s in headed) if theory is None else theory.star == "frame" and theory.hard >= OF_FRAMES
         has_courses = theory is None or theory.hard >= _OF_COURSES
         self._framed = {(s.place, s.heading): s.id for s in headed} if has_frames else {}
         self._seen_at = {s.place: s for s in headed} if has_frames else {}  # a dstate at each place
@@ -104,7 +104,7 @@ class Consequences:
     def _turned(self, s: DState, action: Action) -> Consequence:
         assert action.turn is not None
         if s.place in self._seen_at and s.heading is not None and action.in_quarters:
-            slot = (s.heading + _QUARTERS[action.turn]) % 4
+            slot = (s.heading + QUARTERS[action.turn]) % 4
             if (faced := self._framed.get((s.place, slot))) is not None:
                 return self._to(faced, "implied")
             known = self._seen_at[s.place]

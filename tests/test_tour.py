@@ -1,0 +1,98 @@
+"""Tours through what is untried: the shortest where nothing is unknown, and what they leave for the way back."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import pytest
+from test_explorer import RING, TURNS, Streetwalker
+from worlds import HEADINGS, Streets, streets
+
+from ssh_abduction import Action, Explorer, Theory, Trace, solve
+from ssh_abduction.rivals.tour import _doubted, next_tour
+
+ENDS = [(1, 0, 0, 0), (0, 0, 1, 0)]
+TWO = streets(("a", "E", "b"))
+THREE = (0, 120, 240)
+
+
+def shortest(world: Streets, at: tuple[str, int], seen: set[object], actions: tuple[str, ...]) -> int:
+    """How many actions it takes at least to see all dstates and do all travels that are not seen, by breadth first search."""
+    everything = {(place, k) for place in world for k in range(4)} | {(place, heading) for place, ways in world.items() for heading in ways}
+    queue = deque([(at, frozenset(everything - seen), 0)])
+    known = set()
+    while True:
+        (place, facing), left, steps = queue.popleft()
+        if not left:
+            return steps
+        for action in actions:
+            heading = HEADINGS[facing]
+            if action != "travel":
+                there = place, (facing + TURNS[action]) % 4
+            elif heading in world[place]:
+                there = world[place][heading], facing
+            else:
+                continue
+            after = there, left - {there} - ({(place, heading)} if action == "travel" else set())
+            if after not in known:
+                known.add(after)
+                queue.append((*after, steps + 1))
+
+
+@pytest.mark.parametrize("actions", [("right", "travel"), ("right", "left", "travel"), (*TURNS, "travel")])
+def test_a_tour_is_as_short_as_can_be_where_every_end_is_expected(actions: tuple[str, ...]) -> None:
+    trace = Trace.from_steps(["end", "wall"], ["travel"], stars=ENDS)
+    tour = next_tour(solve(trace).maps[0], trace, actions=actions)
+    assert len(tour) == shortest(TWO, ("b", 1), {("a", 1), ("b", 1), ("a", "E")}, actions)
+
+
+def test_a_robot_drives_on_before_it_looks_around_where_it_will_come_back() -> None:
+    alone = Trace.from_steps(["end"], [], stars=ENDS[:1])
+    assert next_tour(solve(alone).maps[0], alone, actions=(*TURNS, "travel")) == ("travel",)
+
+
+def test_nothing_is_left_where_all_was_tried() -> None:
+    driven = Trace.from_steps(
+        ["end", "wall", "back", "wall back", "end"], ["travel", "around", "travel", "around"], stars=[*ENDS, *ENDS, ENDS[0]]
+    )
+    ssh_map = solve(driven).maps[0]
+    assert next_tour(ssh_map, driven) == ()
+    assert next_tour(ssh_map, driven, actions=["right"]) != ()
+
+
+def test_what_cannot_be_done_there_is_not_planned() -> None:
+    alone = Trace.from_steps(["end"], [], stars=ENDS[:1])
+    assert next_tour(solve(alone).maps[0], alone, actions=("right", "travel"), can=lambda seen: ["right"])[0] == "right"
+
+
+def test_gateways_tell_where_turns_lead() -> None:
+    turns = [Action("right 1", "turn", "right", gateway=1), Action("left 1", "turn", "left", gateway=1)]
+    theory = Theory.causal().replace(star="alike")
+    trace = Trace.from_steps(["tri", "wall", "end", "back"], ["travel", "around", "travel"], stars=[THREE, (180,), (0,), (60, 180, 300)])
+    tour = next_tour(solve(trace, theory).maps[0], trace, theory=theory, actions=turns)
+    assert tour in (("left 1", "travel"), ("right 1", "travel"))  # to a gateway that it never went through
+    looked = Trace.from_steps(["tri", "one", "two", "tri"], [turns[0]] * 3, stars=[THREE] * 4)
+    assert (
+        next_tour(solve(looked, theory).maps[0], looked, theory=theory, actions=[turns[1]]) == ("left 1",) * 3
+    )  # the ends are expected, and still to be tried
+
+
+def test_actions_that_say_nothing_of_themselves_are_tried_where_they_were_not() -> None:
+    trace = Trace.from_steps(["a", "b", "a"], ["p", "p"])
+    ssh_map = solve(trace, Theory.causal()).maps[0]
+    assert next_tour(ssh_map, trace, theory=Theory.causal()) == ()
+    assert next_tour(ssh_map, trace, theory=Theory.causal(), actions=["q"]) == ("q",)
+
+
+def test_returns_are_doubted_until_enough_was_seen_there() -> None:
+    explorer = Explorer(Streetwalker(RING, "a", "E"), limit=None)
+    doubts = 0
+    for _ in range(16):
+        explorer.step()
+        ssh_map, trace = explorer.solution.maps[0], explorer.trace
+        split = _doubted(ssh_map, trace, 4)
+        pairs = {(a, b) for a, b in zip(split.labels, ssh_map.labels, strict=True)}
+        assert len(pairs) == len(split.dstates)  # only ever divided
+        assert _doubted(ssh_map, trace, 0).labels == ssh_map.labels
+        doubts += len(split.places) > len(ssh_map.places)
+    assert doubts
