@@ -258,14 +258,19 @@ function mapFigure(i, rival) {
   return figure;
 }
 
-// How far points are from their nearest ones, so that nine in ten are farther: in units of the map.
-function crowding(points) {
-  const some = points.slice(0, 300), nearest = some.map((p) => {
+// How far each point is from the nearest other one, in units of the map.
+function nearestOf(points) {
+  return points.map((p) => {
     let best = Infinity;
     for (const q of points) { const d = Math.hypot(p[0] - q[0], p[1] - q[1]); if (d > 1e-6 && d < best) best = d; }
     return best;
-  }).filter(Number.isFinite).sort((a, b) => a - b);
-  return nearest.length ? nearest[Math.floor(nearest.length / 10)] : 1;
+  });
+}
+
+// The same in the middle of all of them.
+function crowding(points) {
+  const known = nearestOf(points.slice(0, 300)).filter(Number.isFinite).sort((a, b) => a - b);
+  return known.length ? known[Math.floor(known.length / 2)] : 1;
 }
 
 function clear(figure, x, y, w, h) { return figure.boxes.every(([l, t, r, b]) => x + w <= l || x - w >= r || y + h <= t || y - h >= b); }
@@ -296,20 +301,22 @@ function paintFigure(figure) {
   figure.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   figure.base.replaceChildren();
   const apart = (figure.crowding ??= crowding(figure.points)) * figure.k;
-  const r = Math.min(12, Math.max(3, 0.17 * apart)); // of a place
+  const r = Math.min(12, Math.max(3, 0.17 * apart)); // of a place; where another one is near, it is smaller
   figure.radius = r;
+  figure.nearest ??= nearestOf(figure.points);
+  const radii = new Map(figure.points.map((at, k) => [`${at}`, Math.min(r, Math.max(3, 0.36 * figure.nearest[k] * figure.k))])), radiusAt = (at) => radii.get(`${at}`) ?? r;
   const see = (at) => onScreen(figure, at);
   const spots = figure.nodes.map((node) => see(node.at));
   for (const street of figure.streets) paintStreet(figure, street, see(street.a), see(street.b), spots, r);
   paintEllipses(figure, see);
   figure.nodes.forEach((node, k) => {
-    const [x, y] = spots[k];
+    const [x, y] = spots[k], r = radiusAt(node.at);
     const circle = element("svg:circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: r.toFixed(1), class: classes("node", node.kind) }, null, figure.base);
     element("svg:title", {}, node.title, circle);
     keep(figure, x, y, r, r);
     if (node.name && r >= 6) element("svg:text", { class: "name inside", x: x.toFixed(1), y: y.toFixed(1), "font-size": Math.min(12, r * 1.15, (3 * r) / node.name.length).toFixed(1) }, node.name, figure.base);
   });
-  paintMarks(figure, see, r);
+  paintMarks(figure, see, radiusAt);
   const named = new Set();
   for (const m of figure.marks) if (m.name && apart > (figure.marks.length > 150 ? 70 : m.bare ? 24 : 40)) label(figure, m.name, [m.x, m.y], m.size + 2, around(m));
   for (const street of figure.streets) if (street.names && apart > 60) { const [x, y, c, s] = street.middle; label(figure, street.names.length > 24 ? `${street.names.slice(0, 23)}…` : street.names, [x, y], 3, [[c, s], [-c, -s]], "soft"); }
@@ -353,10 +360,11 @@ function paintEllipses(figure, see) {
 }
 
 // Headed marks stand at their place on the side that they face, to the right of the line of their path; where many crowd there, farther out. A mark without a heading is a dot.
-function paintMarks(figure, see, r) {
-  const size = Math.max(3.5, r * 0.85), crowds = new Map();
+function paintMarks(figure, see, radiusAt) {
+  const crowds = new Map();
   figure.arrows.forEach((arrow) => { const key = arrow.at.map((n) => n.toFixed(3)).join(" "); crowds.set(key, [...(crowds.get(key) ?? []), arrow]); });
   for (const crowd of crowds.values()) {
+    const r = radiusAt(crowd[0].at), size = Math.max(3.5, r * 0.85);
     const headed = crowd.filter((m) => m.heading !== null).sort((p, q) => p.heading - q.heading);
     let least = Math.PI / 2;
     headed.forEach((m, k) => { const next = headed[(k + 1) % headed.length], gap = (next.heading - m.heading + 2 * Math.PI) % (2 * Math.PI); if (headed.length > 1 && gap > 0.15) least = Math.min(least, gap); });
