@@ -41,7 +41,16 @@ FILES = [
     for folder in ("benchmarks", "encodings", "examples", "perception", "simulator", "ssh_abduction", "tests")
     for path in (ROOT / folder).rglob("*.*")
 ]
-EXAMPLES = {"own.lp", "run.jsonl", "NAME.lp", "NAME.py", "compass.lp", "corners.lp", "views.jsonl"}  # files that a reader has, or makes
+EXAMPLES = {
+    "own.lp",
+    "run.jsonl",
+    "run.truth.json",
+    "NAME.lp",
+    "NAME.py",
+    "compass.lp",
+    "corners.lp",
+    "views.jsonl",
+}  # files that a reader has, or makes
 
 
 CODES = {1: ": error:", 20: "unsatisfiable: ", 30: "OPTIMUM FOUND"}  # the last one is clingo's own
