@@ -38,7 +38,7 @@ ABSOLUTE = (
 
 FILES = [
     path
-    for folder in ("benchmarks", "encodings", "examples", "perception", "simulator", "ssh_abduction", "tests")
+    for folder in ("benchmarks", "encodings", "examples", "perception", "simulator", "ssh_abduction", "tests", "website")
     for path in (ROOT / folder).rglob("*.*")
 ]
 EXAMPLES = {
