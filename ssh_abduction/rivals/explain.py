@@ -158,7 +158,8 @@ class PairExplanation:
             elif side.cost is None or best is None:
                 told[name] = "what it costs was not found out"
             elif side.cost.preferred_by(self.theory) == best.preferred_by(self.theory):
-                told[name] = f"costs nothing: {_told(side.cost, self.theory.priorities)}"
+                known = "costs nothing" if side.proven else "nothing that costs less is known"
+                told[name] = f"{known}: {_told(side.cost, self.theory.priorities)}"
             else:
                 told[name] = f"{'' if side.proven else 'at most, '}{_difference(side.cost, best, self.theory)}"
         return told
