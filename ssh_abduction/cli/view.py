@@ -60,7 +60,9 @@ def run(options: argparse.Namespace) -> int:
     trace = Trace.load(options.trace) if options.trace is not None else None
     theory = Theory.from_dict(data["theory"]) if isinstance(data, dict) and "theory" in data else None
     flags = "" if theory is None else "".join(f" {shlex.quote(flag)}" for flag in flags_of(theory, trace))
-    called = Called(shlex.quote(options.maps), shlex.quote(options.trace) if options.trace else "TRACE", flags)
+    called = Called(
+        "maps.json" if options.maps == "-" else shlex.quote(options.maps), shlex.quote(options.trace) if options.trace else "TRACE", flags
+    )
     localised = _run(options, trace, data)
     if options.serve:
         assert trace is not None
@@ -101,8 +103,12 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     if not isinstance(beliefs, list) or not all(isinstance(belief, dict) for belief in beliefs):
         raise MapError(f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write them with localize --json")
     maps, number = maps_of(data, "maps"), told.get("map", 1)
-    if not is_whole(number) or not 1 <= number <= len(maps) or told.get("dstates", count := len(maps[number - 1].dstates)) != count:
-        raise MapError(f"{named(file)}: map: expected one of the {len(maps)} maps, got {brief(number)}; localise in these maps again")
+    if not is_whole(number) or not 1 <= number <= len(maps):
+        raise MapError(f"{named(file)}: map: expected 1 to {len(maps)}, got {brief(number)}; localise in these maps")
+    if told.get("dstates", count := len(maps[number - 1].dstates)) != count:
+        raise MapError(
+            f"{named(file)}: dstates: expected {count}, as map {number} has, got {brief(told['dstates'])}; localise in these maps, and not in others"
+        )
     if len(beliefs) != len(followed):
         raise MapError(
             f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, got {len(beliefs)}; name that run with --localize"

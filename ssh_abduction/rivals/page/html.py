@@ -13,8 +13,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from ssh_abduction.errors import MapError
-from ssh_abduction.files import write_file
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.maps import SSHMap, write_map
 from ssh_abduction.rivals.listing import Maps
 from ssh_abduction.rivals.page.content import Run, content_of
 from ssh_abduction.trace import Trace
@@ -38,8 +37,8 @@ class Page:
         return html_of(self.content)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the page as an HTML file."""
-        write_file(path, self.html.encode())
+        """Write the page as an HTML file. Raises MapError."""
+        write_map(path, self.html, "page")
 
     def widget(self) -> Any:
         """The page as a widget of notebooks. Raises MapError where anywidget is not installed."""

@@ -609,8 +609,9 @@ function drawImage(images, text, star) {
   const ranges = images?.kind === "ranges" && text !== null;
   if (!ranges && !star?.length) return;
   const behind = (ranges && Math.max(Math.abs(images.first), Math.abs(images.first + images.step * (text.length - 1))) > 100) || star?.some(([bearing]) => Math.abs(((bearing + 540) % 360) - 180) > 100);
-  const svg = element("svg:svg", { class: ranges ? "" : "small", viewBox: `-150 -118 300 ${behind ? 236 : 136}`, role: "img", "aria-label": `${ranges ? "laser image" : "openings"}, ahead is up` }, null, $("image"));
   const spot = (degrees, r) => { const a = (degrees * Math.PI) / 180; return [-Math.sin(a) * r, -Math.cos(a) * r]; };
+  const ahead = ranges && behind && !star?.some(([bearing]) => Math.abs(((bearing + 540) % 360) - 180) < 60) ? Math.max(40, ...[...text].map((c, k) => -spot(images.first + images.step * k, 108 * value(c))[1])) : 118;
+  const svg = element("svg:svg", { class: ranges ? "" : "small", viewBox: `-150 ${-ahead} 300 ${ahead + (behind ? 118 : 18)}`, role: "img", "aria-label": `${ranges ? "laser image" : "openings"}, ahead is up` }, null, $("image"));
   const ring = ranges ? [0.25, 0.5, 1, 2, 5, 10, 20, 50, 100, 1000].find((metres) => images.reach / metres <= 3.99) ?? images.reach : 1;
   for (let k = 1; k * ring <= (ranges ? images.reach : 1); k++) {
     const r = (100 * k * ring) / (ranges ? images.reach : 1);
