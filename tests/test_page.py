@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,11 @@ def test_overview_counts_the_maps_that_have_each_place(route: Trace, rivals: Sol
             counted[steps] = counted.get(steps, 0) + 1
     assert told == counted
     assert min(told.values()) < max(told.values()) == len(rivals) == 4
+    driven = {tuple(sorted((t, t + 1))) for t in range(len(route) - 1)}
+    for a, b, count, agreeing in overview["streets"]:
+        here, there = (overview["nodes"][k]["steps"] for k in (a, b))
+        assert any(tuple(sorted(pair)) in driven for pair in product(here, there))  # orders of paths alone make no street
+        assert agreeing <= count <= 4
 
 
 def hostile() -> tuple[Solution, Trace]:
@@ -117,7 +122,7 @@ def test_ranges_are_drawn_at_the_bearings_that_the_header_says() -> None:
         drawn_images(replace(trace, extra={"beams": {"first": 0, "step": 200}}))
 
 
-def test_images_of_a_sidecar_file_and_panoramas_are_shown(tmp_path: Path) -> None:
+def test_images_of_a_sidecar_file_and_panoramas_are_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shape = [2, 3, 1]
     np.savez(tmp_path / "images.npz", images=np.arange(12).reshape(2, 6) * 20)
     steps = (Step("a", Action("on"), image=1), Step("b", image=0))
@@ -127,6 +132,9 @@ def test_images_of_a_sidecar_file_and_panoramas_are_shown(tmp_path: Path) -> Non
     assert (drawn["kind"], drawn["rows"], drawn["columns"]) == ("panorama", 2, 3)
     assert drawn["images"][1][0] == ALPHABET[0]
     assert drawn["images"][0][0] > drawn["images"][1][0]
+    monkeypatch.setattr("ssh_abduction.rivals.page.images.MOST", 1)
+    with pytest.warns(UserWarning, match="2 images are more than a page holds"):
+        assert drawn_images(trace) is None
     (tmp_path / "images.npz").unlink()
     with pytest.warns(UserWarning, match="the page is made without images"):
         assert drawn_images(trace) is None

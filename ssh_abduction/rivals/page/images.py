@@ -69,6 +69,7 @@ def drawn_images(trace: Trace) -> dict[str, Any] | None:
     first, step = beams_of(trace, most)
     every = max(-(-most // BEAMS), -(-most * len(known) // MOST))
     if -(-most // every) < min(FEWEST, most):
+        _warn_of_too_many(len(known))
         return None
     finite = [image[np.isfinite(image) & (image > 0)] for image in known]
     ranges = np.concatenate(finite)
@@ -97,6 +98,7 @@ def _panoramas(held: Sequence[NDArray[np.float64] | None], shape: Any, each: int
     rows, columns = min(PIXELS[0], shape[0]), min(PIXELS[1], shape[1])
     while rows * columns * shape[2] > each:
         if rows * columns == 1:
+            _warn_of_too_many(sum(image is not None for image in held))
             return None
         rows, columns = max(1, rows // 2), max(1, columns // 2)
     row, column = (np.linspace(0, n - 1, k).round().astype(int) for n, k in ((shape[0], rows), (shape[1], columns)))
@@ -107,3 +109,7 @@ def _panoramas(held: Sequence[NDArray[np.float64] | None], shape: Any, each: int
         "colours": shape[2],
         "images": [None if image is None else _text(image.reshape(shape)[row][:, column].ravel() / 255) for image in held],
     }
+
+
+def _warn_of_too_many(count: int) -> None:
+    warnings.warn(f"{count} images are more than a page holds; the page is made without images", stacklevel=3)
