@@ -15,6 +15,7 @@ import statistics
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import chain, pairwise, product
 from pathlib import Path
 from time import process_time
@@ -78,8 +79,14 @@ def by_map(log: Path, runs: Path) -> Events:
         subprocess.run([sys.executable, "-m", "ssh_abduction", "map", str(log), "-o", str(folder)], check=True, capture_output=True)
     maps = maps_of(read_json(folder / "maps.json"), str(folder / "maps.json"))
     if not maps:
-        raise ValueError(f"{folder}: expected a map, got none")
+        raise ValueError("no map")
     return Events.of(Trace.load(folder / "trace.jsonl"), maps[0])
+
+
+def last_line(error: Exception) -> str:
+    """Why something failed, on one line."""
+    text = error.stderr.decode(errors="replace") if isinstance(error, subprocess.CalledProcessError) else str(error)
+    return text.strip().rpartition("\n")[2]
 
 
 def row_of(log: Path, method: str, truth: Truth, runs: Path) -> dict[str, Any]:
@@ -87,10 +94,14 @@ def row_of(log: Path, method: str, truth: Truth, runs: Path) -> dict[str, Any]:
     began = process_time()
     try:
         events = by_map(log, runs) if method == OURS else by_skeleton(log, *SKELETONS[method])
-    except subprocess.CalledProcessError as error:
-        return row | {"failed": error.stderr.decode(errors="replace").strip().rpartition("\n")[2]}
-    except (OSError, ValueError) as error:
-        return row | {"failed": str(error)}
+    except (OSError, ValueError, subprocess.CalledProcessError) as error:
+        failed = row | {"failed": last_line(error)}
+        trace = runs / name_of(log) / "trace.jsonl"
+        if method == OURS and trace.exists():  # events may be right where no map of them was found
+            events = Events.of(Trace.load(trace))
+            told = judged(replace(events, places=tuple(range(len(events.places)))), truth).to_dict()
+            failed |= {name: told[name] for name in ("events", "event_precision", "event_recall", "passes")}
+        return failed
     return row | {"seconds": process_time() - began, **judged(events, truth).to_dict()}
 
 
@@ -101,7 +112,9 @@ def shown(*values: float | None) -> str:
 def lines_of(row: dict[str, Any]) -> Iterator[str]:
     """A row of the table of real logs, and one more for pairs by relations."""
     if "failed" in row:
-        yield f"| {row['log']} | {row['method']} | {row['failed']} | | | | | | | | |"
+        came = "{1} of {0}".format(*row["passes"]) if "passes" in row else ""
+        found = shown(row["event_precision"], row["event_recall"]) if came else ""
+        yield f"| {row['log']} | {row['method']} | {row['failed']} | {row.get('events', '')} | {found} | {came} | | | | | |"
         return
     pairs, (come, noticed) = row["poses"], row["passes"]
     cells = [
