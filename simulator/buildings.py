@@ -67,9 +67,9 @@ class Building:
     def of(cls, plan: Plan) -> Building:
         """The building of a plan. Raises SimulatorError where a room has no outline."""
         for number, room in enumerate(plan.rooms):
-            if len(room.polygon) < 3:
+            if (corners := len(set(room.polygon))) < 3:
                 raise SimulatorError(
-                    f"{plan.name}: room {number}: expected a bounding_polygon of three points or more, got {len(room.polygon)}; draw its outline"
+                    f"{plan.name}: room {number}: expected a bounding_polygon of three points or more, got {corners}; draw its outline"
                 )
         walls = np.vstack([_outline(room) for room in plan.rooms])
         openings = tuple(_opening(plan, door) for door in plan.doors)

@@ -23,8 +23,8 @@ from ssh_abduction.errors import brief, is_finite
 Array = NDArray[np.float64]
 # Metres and radians a second at which the robot drives and turns.
 SPEED, SPIN = 0.5, 1.0
-# Metres after which a scan is taken.
-EVERY = 0.25
+# Metres after which a scan is taken, and at least.
+EVERY, CLOSEST = 0.25, 0.01
 # A motion is noted in parts, of which so many are as far as it is from scan to scan, so that scans are evenly spaced.
 FINE = 5
 TINY = 1e-9
@@ -101,8 +101,8 @@ class Recorder:
     _turned: float = 0.0
 
     def __post_init__(self) -> None:
-        if not is_finite(self.every) or self.every <= 0:
-            raise SimulatorError(f"every: expected a number of metres above 0, got {brief(self.every)}; a scan each {EVERY} m is usual")
+        if not is_finite(self.every) or self.every < CLOSEST:
+            raise SimulatorError(f"every: expected metres, {CLOSEST} or more, got {brief(self.every)}; a scan each {EVERY} m is usual")
 
     @property
     def taken(self) -> int:

@@ -19,12 +19,16 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d, label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
+from simulator.errors import SimulatorError
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.intp]
 Point = tuple[float, float]
 # Metres, the side of a cell.
 CELL = 0.1
+# Square metres that are planned on at most.
+LARGEST = 200_000
 # Metres around start and goal, and around the part of the plane that is searched.
 MARGIN = 2.0
 # Metres off a wall from which on more room is not better, and how many times as long a metre counts that leads along a wall.
@@ -55,10 +59,15 @@ class FreeSpace:
 
     @classmethod
     def of(cls, segments: Array, radius: float) -> FreeSpace:
-        """The free space between walls, (n, 4) metres."""
+        """The free space between walls, (n, 4) metres. Raises SimulatorError where it is too large for a grid."""
         ends = segments.reshape(-1, 2)
         corner = ends.min(0) - MARGIN
-        columns, rows = np.ceil((ends.max(0) + MARGIN - corner) / CELL).astype(int)
+        width, height = ends.max(0) + MARGIN - corner
+        if width * height > LARGEST:
+            raise SimulatorError(
+                f"walls: expected them on at most {LARGEST:,} square metres, on which ways can be planned, got {width:,.0f} x {height:,.0f} m; check the scale"
+            )
+        columns, rows = math.ceil(width / CELL), math.ceil(height / CELL)
         space = cls((float(corner[0]), float(corner[1])), np.zeros((rows, columns), bool), radius)
         return cls(space.corner, space.drawn(segments), radius)
 

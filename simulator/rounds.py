@@ -52,7 +52,7 @@ class Rooms:
     def __init__(self, building: Building, radius: float) -> None:
         self.building = building
         self.space = FreeSpace.of(building.segments, radius)
-        self._shut = self.space.drawn(np.vstack([opening.threshold for opening in building.openings]))
+        self._shut = self.space.drawn(np.array([opening.threshold for opening in building.openings]).reshape(-1, 4))
         self._sides = [_sides(building, number) for number in range(len(building.openings))]
         self._ways: dict[Within, Array] = {}
         self.middles: dict[int, Point] = {}

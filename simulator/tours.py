@@ -142,8 +142,13 @@ def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]
             x, y, _ = driver.robot.pose
             way = space.part(world.segments.reshape(-1, 2)).way((x, y), world.stops[stop])
             if way is None:
-                raise SimulatorError(f"{world.name}: route: expected a way from ({x:.2f}, {y:.2f}) to {stop}, got none; open the walls")
-            deque(follow(driver, space, way), maxlen=0)
+                off = world.clearance(*world.stops[stop])
+                mend = f"open the walls, or move {stop}, which is {off:.2f} m off the nearest one"
+                raise SimulatorError(f"{world.name}: route: expected a way from ({x:.2f}, {y:.2f}) to {stop}, got none; {mend}")
+            try:
+                deque(follow(driver, space, way), maxlen=0)
+            except SimulatorError as error:
+                raise SimulatorError(f"{error} (on the way to {stop}, on tour {tour + 1})") from None
 
 
 def _driver(world: World, tours: int, seed: int, laser: Laser | None, body: Body | None, tolerance: Tolerance | None) -> Driver:

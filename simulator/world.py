@@ -32,6 +32,8 @@ FORMAT, VERSION = "ssh-world", 1
 ACTIONS = ("travel", "right", "left", "around")
 # Degrees that the straight pieces of an arc are long at most, and metres of those of a ragged wall.
 ARC, RAGGED = 5.0, 0.3
+# Metres of walls that may be ragged.
+LONGEST = 20_000
 # Radians that a wall may be off a right angle; and of all walls at most this share may be off by more. So a column, or a corner that is cut off, leaves a world right-angled.
 SQUARE, OBLIQUE = math.radians(5), 0.1
 # The smallest `reach` of a world, in metres: a laser reports no range that is smaller.
@@ -277,6 +279,8 @@ class _Reader:
             raise self.wrong("ragged", "metres by which walls are uneven, 0 to 1", value)
         if not value:
             return walls
+        if np.hypot(*(walls[:, 2:] - walls[:, :2]).T).sum() > LONGEST:
+            raise self.wrong("ragged", f"walls of at most {LONGEST:,} m together, as uneven walls have many pieces", value)
         pieces = []
         for x1, y1, x2, y2 in walls:
             line = np.linspace((x1, y1), (x2, y2), 1 + math.ceil(math.hypot(x2 - x1, y2 - y1) / RAGGED))

@@ -86,7 +86,7 @@ def test_scans_are_taken_all_along() -> None:
     np.testing.assert_array_equal(drive.ranges, np.where(seen < 2.5, seen, np.inf))
     assert np.isinf(drive.ranges[0]).any()
     assert (np.diff(drive.times) > 0).all()
-    with pytest.raises(SimulatorError, match="every: expected a number of metres above 0"):
+    with pytest.raises(SimulatorError, match=r"every: expected metres, 0\.01 or more, got 0"):
         Recorder(every=0.0)
 
 
@@ -156,12 +156,17 @@ def test_a_robot_drives_through_doors_from_room_to_room(ring: Building) -> None:
     assert len(set(rounds)) > 2
 
 
-def test_rounds_that_cannot_be_driven(ring: Building) -> None:
-    for body, what in ((Body(radius=0.6), "through which the robot fits"),):
-        with pytest.raises(SimulatorError, match=what):
-            record_plan(ring.plan, body=body)
+def test_rounds_that_cannot_be_driven(ring: Building, tmp_path: Path) -> None:
+    with pytest.raises(SimulatorError, match="through which the robot fits, got none"):
+        record_plan(ring.plan, body=Body(radius=0.6))
     with pytest.raises(SimulatorError, match="tours: expected 1 or more"):
         record_plan(ring.plan, tours=0)
+    with pytest.raises(SimulatorError, match="through which the robot fits, got none"):
+        record_plan(replace(ring.plan, doors=()))
+    with pytest.raises(
+        SimulatorError, match=r"walls: expected them on at most 200,000 square metres, .*, got 2,784 x 1,984 m; check the scale"
+    ):
+        record_plan(plan_of(tmp_path, xml(unit="m")))
     with pytest.raises(SimulatorError, match="metres: expected a length above 0"):
         record_plan(ring.plan, metres=0.0)
     with pytest.raises(SimulatorError, match="room 4: expected a bounding_polygon"):
@@ -216,6 +221,7 @@ def test_walls_may_be_round_uneven_or_those_of_an_occupancy_map(tmp_path: Path) 
         ({"arcs": [[0, 0, 1, 90, 0]]}, r"arcs\[0\]: expected \[x, y, radius above 0, from, to\]"),
         ({"arcs": [[0, 0, 1]]}, r"arcs\[0\]: expected 5 finite numbers"),
         ({"ragged": 2}, "ragged: expected metres by which walls are uneven"),
+        ({"ragged": 0.1, "arcs": [[0, 0, 1e5, 0, 360]]}, "ragged: expected walls of at most 20,000 m together"),
         ({"occupancy": 3}, "occupancy: expected the name of a YAML file"),
         ({"places": [1]}, "places: expected an object of names and points"),
         ({"places": {"a": [1]}}, r"places\.a: expected 2 finite numbers"),
@@ -241,7 +247,9 @@ def test_worlds_with_places_name_what_is_wrong(changes: dict[str, object], messa
 def test_a_route_of_places_that_cannot_be_driven(tmp_path: Path) -> None:
     fields = {"format": "ssh-world", "version": 1, "polygons": [[[0, 0], [4, 0], [4, 2], [0, 2]]], "places": {"a": [1, 1], "b": [3, 1]}}
     (tmp_path / "world.json").write_text(json.dumps({**fields, "segments": [[2, 0, 2, 2]], "route": ["a", "b"]}))
-    with pytest.raises(SimulatorError, match=r"route: expected a way from \(1\.00, 1\.00\) to b, got none; open the walls"):
+    with pytest.raises(
+        SimulatorError, match=r"route: expected a way from \(1\.00, 1\.00\) to b, got none; open the walls, or move b, which is 1\.00 m off"
+    ):
         record(World.load(tmp_path / "world.json"))
     with pytest.raises(SimulatorError, match=r"route: expected actions, got places, .*; write --as carmen"):
         simulate(World.load(tmp_path / "world.json"))
@@ -346,6 +354,22 @@ def test_simulate_writes_logs_that_can_be_read(tmp_path: Path, capsys: pytest.Ca
     assert b"PARAM simulator_odometry_scale 0.1 " in gzip.decompress((tmp_path / "run.log.gz").read_bytes())
 
 
+def test_a_bag_says_what_its_odometry_is_worth(tmp_path: Path) -> None:
+    """The covariance of the pose grows from zero, as the odometer has it."""
+    rosbags = pytest.importorskip("rosbags.highlevel")
+    bag = tmp_path / "run.bag"
+    assert main(["simulate", "triangle", "--route", "A,B", "--as", "bag", "-o", str(bag)]) == 0
+    log = read_log(bag)
+    with rosbags.AnyReader([bag], default_typestore=None) as reader:
+        messages = [
+            reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages([c for c in reader.connections if c.topic == "/odom"])
+        ]
+    told = np.array([message.pose.covariance for message in messages]).reshape(-1, 6, 6)[:, [[0], [1], [5]], [0, 1, 5]]
+    np.testing.assert_allclose(told, Odometer().covariances(np.array([scan.odometry for scan in log.scans])), atol=1e-6)
+    assert not told[0].any()
+    assert told[-1, 2, 2] > 0.001
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -353,7 +377,7 @@ def test_simulate_writes_logs_that_can_be_read(tmp_path: Path, capsys: pytest.Ca
         (["school.xml", "--as", "carmen", "--reach", "1"], "--reach: expected none beside a floor plan"),
         (["triangle", "--as", "carmen", "--no-stars"], "--no-stars: expected none beside --as"),
         (["triangle", "--as", "carmen", "--images", "panoramas"], "--images panoramas: expected none beside --as"),
-        (["triangle", "--as", "carmen", "--every", "0"], "every: expected a number of metres above 0, got 0"),
+        (["triangle", "--as", "carmen", "--every", "0"], "every: expected metres, 0.01 or more, got 0"),
         (["triangle", "--as", "carmen", "--odometry-noise", "nan"], "--odometry-noise: expected a number from 0 to 1, got nan"),
     ],
 )
