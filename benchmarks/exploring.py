@@ -14,6 +14,8 @@ ever more steps, and then by halving. The explorer also says itself when it is d
     hW             AALpy's learner without resets. Its oracle knows the truth and costs nothing but the steps of a shortest counterexample, and so does an action that cannot be done: so hW is better here than
                    it could be. It is told views, with stars on plans, learns all links, and has done once its machine predicts the same as the world
 
+The table tells the shortest walk, too, that sees and does everything: what a driver who knew the world could not better.
+
 Theories: mazes topological, with stars; plans causal, with stars that are alike in tolerance.
 """
 
@@ -36,6 +38,7 @@ from truth import Known, is_true, share_all
 from simulator.plans import Floor, Plan
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.explorer import Explorer
+from ssh_abduction.rivals.tour import Move, shortest_flow
 from ssh_abduction.trace import Action, Step
 
 ROOT = Path(__file__).parent.parent
@@ -171,6 +174,17 @@ def states_of(world: World) -> dict[Any, dict[Action, Any]]:
 def everything(ends: dict[Any, dict[Action, Any]]) -> set[Any]:
     """What has to be seen and done: all dstates, and all travels."""
     return {*ends} | {(state, action.name) for state in ends for action in ends[state] if action.kind == "travel"}
+
+
+def shortest(world: World) -> int:
+    """How many actions it takes at least to visit all dstates and do all travels, for a driver who knows the world."""
+    ends = states_of(world)
+    number = {state: n for n, state in enumerate(ends)}
+    moves = [Move(number[state], action, number[there], "known") for state in ends for action, there in ends[state].items()]
+    travels = {k for k, move in enumerate(moves) if move.action.kind == "travel"}
+    times = shortest_flow(moves, number[world.start], travels, set(number.values()), rounds=1000)
+    assert times is not None
+    return sum(times)
 
 
 def covered_after(robot: Driven) -> int | None:
@@ -332,38 +346,39 @@ def worlds(options: argparse.Namespace) -> Iterator[tuple[World, int]]:
 
 
 def table(records: Sequence[Record]) -> str:
-    """A row for each world, and the medians: steps until the robot has the map, and when the explorer stops."""
+    """A row for each world, and the medians: steps until the robot has the map, and when the explorer stops. Where it was not driven so long, nothing is said of that."""
     names = [*dict.fromkeys(record["world"] for record in records)]
     by = {(record["world"], record["strategy"]): record for record in records}
-    lines = ["| world | dstates | explorer | it stops | then true | random | rule | hW | explorer / best other |", "|---" * 9 + "|"]
-    columns: dict[str, list[float]] = {name: [] for name in (*STRATEGIES, "stopped", "ratio")}
+    lines = ["| world | dstates | shortest | explorer | random | rule | hW | explorer / best other | it stops | then |", "|---" * 10 + "|"]
+    columns: dict[str, list[float]] = {name: [] for name in (*STRATEGIES, "shortest", "stopped", "ratio")}
+    ends: list[str] = []
     for name in names:
         row = {strategy: by.get((name, strategy), {}) for strategy in STRATEGIES}
         steps = {strategy: float("inf") if said.get("steps") is None else said["steps"] for strategy, said in row.items()}
         best = min(steps[strategy] for strategy in STRATEGIES[1:])
         for strategy in STRATEGIES:
             columns[strategy].append(steps[strategy])
-        columns["stopped"].append(row["explorer"].get("stopped", float("inf")))
         columns["ratio"].append(steps["explorer"] / best if best < float("inf") else 0.0 if steps["explorer"] < float("inf") else 1.0)
-        told = [_told(steps[s], row[s]) for s in STRATEGIES]
-        ending = "yes" if row["explorer"].get("true") else "no"
-        if not row["explorer"].get("done"):
-            ending += ", not done"
+        some = next(record for record in records if record["world"] == name)
+        columns["shortest"].append(some["shortest"])
+        said = row["explorer"]
+        if "stopped" in said:
+            columns["stopped"].append(said["stopped"])
+            ends.append(f"{said['ending']}, {'true' if said['true'] else 'not true'}")
         lines.append(
-            f"| {name} | {row['explorer'].get('dstates', '')} | {told[0]} | {row['explorer'].get('stopped', '')} | {ending} | {told[1]} | {told[2]} | {told[3]} | "
-            f"{columns['ratio'][-1]:.2f} |"
+            f"| {name} | {some['dstates']} | {some['shortest']} | {' | '.join(_told(steps[s], row[s]) for s in STRATEGIES)} | {columns['ratio'][-1]:.2f} | "
+            f"{said.get('stopped', '')} | {ends[-1] if 'stopped' in said else ''} |"
         )
-    medians = {name: statistics.median(values) for name, values in columns.items()}
-    true = sum(bool(by[name, "explorer"].get("true")) for name in names if (name, "explorer") in by)
+    medians = {name: _number(statistics.median(values)) if values else "" for name, values in columns.items()}
     lines.append(
-        f"| median of {len(names)} | | {_number(medians['explorer'])} | {_number(medians['stopped'])} | {true} of {len(names)} | {_number(medians['random'])} | {_number(medians['rule'])} | "
-        f"{_number(medians['hW'])} | {medians['ratio']:.2f} |"
+        f"| median of {len(names)} | | {medians['shortest']} | {' | '.join(medians[s] for s in STRATEGIES)} | {statistics.median(columns['ratio']):.2f} | "
+        f"{medians['stopped']} | {'; '.join(f'{ends.count(end)} {end}' for end in dict.fromkeys(ends))} |"
     )
     return "\n".join(lines)
 
 
 def _told(steps: float, said: Record) -> str:
-    return _number(steps) if steps < float("inf") else f"not in {said['driven']:,}" if "driven" in said else "–"
+    return _number(steps) if steps < float("inf") else f"not in {said['driven']:,}" if "driven" in said else ""
 
 
 def _number(steps: float) -> str:
@@ -440,13 +455,21 @@ def main() -> None:
     stored = options.out.read_text().splitlines() if options.out and options.out.exists() else []
     known = {(record["world"], record["strategy"]) for record in map(json.loads, stored)}
     for world, seed in worlds(options):
+        least = shortest(world)
         for strategy in options.strategies.split(","):
             if (world.name, strategy) in known:
                 continue
             most = min(options.most, 2000) if strategy == "explorer" else options.most
             told = {"seconds": options.seconds, "judged": options.judged} if strategy == "explorer" else {}
             said = RUN[strategy](world, seed, most, options.limit, **told)
-            record = {"family": family, "world": world.name, "dstates": len(states_of(world)), "strategy": strategy, **said}
+            record = {
+                "family": family,
+                "world": world.name,
+                "dstates": len(states_of(world)),
+                "shortest": least,
+                "strategy": strategy,
+                **said,
+            }
             print(json.dumps(record), flush=True)
             if options.out:
                 with options.out.open("a") as file:

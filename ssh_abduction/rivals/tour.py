@@ -55,6 +55,10 @@ How: TypeAlias = Literal["known", "implied", "expected", "unknown"]
 THERE_AND_BACK = 3
 # Seconds for a flow. Where they are over, the robot goes to what is untried and nearest.
 PATIENCE = 2.0
+# So often, at most, what is cut off is forbidden. Then the robot does the part of the walk that hangs together with where it is, and the next plan the rest.
+ROUNDS = 8
+# With more moves than these a flow takes about a second, and the robot goes to what is untried and nearest.
+MOST_MOVES = 1500
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +108,8 @@ def next_tour(
         due = {k for k, move in enumerate(moves) if move.how == "expected"}
     if not due and not unseen:
         return ()
-    return _walk(moves, start, due, unseen) or _nearest(moves, start, due, unseen)
+    walk = _walk(moves, start, due, unseen) if len(moves) <= MOST_MOVES else ()
+    return walk or _nearest(moves, start, due, unseen)
 
 
 def _doubted(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
@@ -326,7 +331,7 @@ def _followed(links: Iterable[tuple[T, T]], start: T) -> set[T]:
 
 def _walk(moves: Sequence[Move], start: int, due: set[int], unseen: set[int]) -> tuple[str, ...]:
     """The shortest walk that makes these moves and gets to these stances, up to the first unknown move. None is found where no walk does all, or in no time."""
-    times = _flow(moves, start, due, unseen)
+    times = shortest_flow(moves, start, due, unseen)
     if times is None:
         return ()
     left = {k: n for k, n in enumerate(times) if n}
@@ -347,8 +352,11 @@ def _walk(moves: Sequence[Move], start: int, due: set[int], unseen: set[int]) ->
     return tuple(actions)
 
 
-def _flow(moves: Sequence[Move], start: int, due: set[int], unseen: set[int]) -> list[int] | None:
-    """How often each move is made on the shortest walk; None where there is none, or no time."""
+def shortest_flow(moves: Sequence[Move], start: int, due: set[int], unseen: set[int], rounds: int = ROUNDS) -> list[int] | None:
+    """How often each move is made on the shortest walk that makes those that are due and gets to what is unseen; None where there is none, or no time.
+
+    After so many rounds it may be the part of such a walk that hangs together with the start.
+    """
     number = {n: i for i, n in enumerate(sorted(_reached(moves, start)))}
     m, size = len(moves), len(number)
     sources, targets = (np.array([number[n] for n in ends]) for ends in ([x.source for x in moves], [x.target for x in moves]))
@@ -367,7 +375,7 @@ def _flow(moves: Sequence[Move], start: int, due: set[int], unseen: set[int]) ->
     ]
     costs = np.r_[[float(move.cost) for move in moves], np.zeros(size)]
     bounds = Bounds(np.r_[[float(k in due) for k in range(m)], np.zeros(size)], np.r_[np.full(m, float(size)), np.ones(size)])
-    while True:
+    for _ in range(rounds):
         found = milp(costs, constraints=rules, integrality=np.ones(m + size), bounds=bounds, options={"time_limit": PATIENCE})
         if found.x is None:
             return None
@@ -375,12 +383,14 @@ def _flow(moves: Sequence[Move], start: int, due: set[int], unseen: set[int]) ->
         used = [move for move, n in zip(moves, times, strict=True) if n]
         parts = _parts_cut_off(used, start)
         if not parts:
-            return [int(n) for n in times]
+            break
         for part in parts:
             entering = [k for k, move in enumerate(moves) if move.target in part and move.source not in part]
             rules.append(
                 LinearConstraint(coo_array((np.ones(len(entering)), ([0] * len(entering), entering)), (1, m + size)).tocsr(), 1, np.inf)
             )
+    near = _reached([move for move, n in zip(moves, times, strict=True) if n], start)
+    return [int(n) if move.source in near else 0 for move, n in zip(moves, times, strict=True)]
 
 
 def _parts_cut_off(used: Sequence[Move], start: int) -> list[set[int]]:
@@ -398,7 +408,7 @@ def _parts_cut_off(used: Sequence[Move], start: int) -> list[set[int]]:
 def _nearest(moves: Sequence[Move], start: int, due: set[int], unseen: set[int]) -> tuple[str, ...]:
     """The way to the nearest of these moves, and stances; none where no moves lead to any."""
     after: dict[int, list[int]] = {}
-    for k, move in enumerate(moves):
+    for k, move in sorted(enumerate(moves), key=lambda pair: pair[0] not in due):
         after.setdefault(move.source, []).append(k)
     ways: dict[int, tuple[str, ...]] = {start: ()}
     queue = deque([start])
