@@ -85,6 +85,9 @@ RUN = [
 ]
 
 
+LINE = re.compile(r".*<<'(\w+)'\n(?:.*\n)*?\1\n|(?:.*\\\n)*.+\n")  # with the text that it is given, or with the lines in which it goes on
+
+
 def run(block: Block) -> tuple[str, int]:
     """What the lines print here, and the exit code."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
@@ -92,29 +95,40 @@ def run(block: Block) -> tuple[str, int]:
             exec(block.lines, {})
             return out.getvalue(), 0
         code = 0
-        for line in [block.lines] if set(block.lines) & set("<$\\") else block.lines.splitlines():  # what one line leaves to the next
-            code = run_line(line)
+        if "$(" in block.lines:  # what one line leaves to the next
+            code = shell(block.lines)
+        else:
+            for line in LINE.finditer(block.lines):
+                code = run_line(line[0])
     return out.getvalue(), code
 
 
 def run_line(line: str) -> int:
-    """Run a line of a shell, and print what it prints; returns the exit code. Where it is a command of ours alone, no process is begun, which saves the time to load all."""
-    line = re.sub(r"\s+# .*", "", line)
-    command, _, target = line.partition(" > ")
-    if not command.startswith("ssh-abduction ") or set(line) & set("|*$;&<\\"):
-        ours = re.sub(r"(?<![\w/-])ssh-abduction(?= )", f"{shlex.quote(sys.executable)} -m ssh_abduction", line)
-        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # so that python is this one
-        done = subprocess.run(ours, shell=True, capture_output=True, text=True, check=False, env={**os.environ, "PATH": path})
-        print(done.stdout, end="")
-        return done.returncode
+    """Run a line of a shell, and print what it prints; returns the exit code. Our own command is run in this process, which saves the time to load all."""
+    line = line if "<<" in line else re.sub(r"\s+# .*", "", line).rstrip()
+    command, pipe, reader = line.partition(" | ")
+    command, _, target = command.partition(" > ")
+    if not command.startswith("ssh-abduction ") or set(command) & set("*$;&<\\"):
+        return shell(line)
     with contextlib.redirect_stdout(io.StringIO()) as out, warnings.catch_warnings():
         warnings.simplefilter("default")
         code = main(shlex.split(command)[1:])
+    if pipe:
+        return shell(reader, out.getvalue())
     if target:
         Path(target).write_text(out.getvalue(), encoding="utf-8")
     else:
         print(out.getvalue(), end="")
     return code
+
+
+def shell(lines: str, given: str = "") -> int:
+    """Run lines in a process of their own, in which python is this one, and print what they print; returns the exit code."""
+    lines = re.sub(r"(?<![\w/-])ssh-abduction(?= )", f"{shlex.quote(sys.executable)} -m ssh_abduction", lines)
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(lines, shell=True, input=given, capture_output=True, text=True, check=False, env=environment)
+    print(done.stdout, end="")
+    return done.returncode
 
 
 def without_seconds(text: str) -> str:
