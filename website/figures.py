@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 os.environ["SOURCE_DATE_EPOCH"] = "0"  # matplotlib writes a date into its files, which would differ from run to run
@@ -55,6 +56,7 @@ def folded() -> SSHMap:
     return solve(Trace.load(EXAMPLES / "notched-rectangle.jsonl"), without=("side_of_branch",)).maps[0]
 
 
+@cache
 def rivals() -> tuple[SSHMap, ...]:
     """The minimal maps of the ACES3 route."""
     return tuple(solve(Trace.load(EXAMPLES / "aces3-route.jsonl"), maps=0).maps)
