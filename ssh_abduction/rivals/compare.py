@@ -207,7 +207,7 @@ class Comparison:
         more = len(self.ids) - count
         if more:
             told += f", and {more} larger ones"
-        if count == 1 and not more and (self.complete is not False or self.stopped == "no proof"):
+        if count == 1 and not more and (self.complete is not False or self.minimal is None):
             return told
         told += f": {self._differences}"
         if self.complete is False and not self.shared.proven:

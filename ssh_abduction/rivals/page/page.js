@@ -232,7 +232,7 @@ function overviewFigure() {
     title: `${isPlaces ? "a street" : "a link"} that ${count} of ${all} maps have${path < count ? `; what else is along its path is the same in ${path} of them` : ""}` })).sort((p, q) => p.count - q.count);
   const known = new Map();
   for (const told of data.maps) for (const k of told.faults ?? []) known.set(k, (known.get(k) ?? 0) + 1);
-  figure.faults = [...known].map(([k, count]) => ({ step: data.faults[k][0], title: `${data.faults[k][1]}: in ${count} of ${all} maps` }));
+  figure.faults = [...known].map(([k, count]) => ({ step: data.faults[k][0], disputed: count < all, title: `${data.faults[k][1]}: in ${count} of ${all} maps` }));
   figure.points = at;
   figure.layout = data.layouts[data.maps[0].layout];
   figure.labels = labelsOf(0);
@@ -251,7 +251,7 @@ function mapFigure(i, rival) {
   figure.streets = ssh.streets.filter(({ travelled }) => travelled || !other).map(({ path, from, to, key, travelled }) => ({ a: ssh.places.get(from), b: ssh.places.get(to), kind: `${kindOf(key, path)}${travelled ? "" : " order"}`.trim(), colour: other ? null : path % COLOURS, path,
     title: `path ${path}, from place ${from} to place ${to}${travelled ? "" : ": only the order of the path says so, nobody travelled there"}` }));
   for (const { from, to, actions, key } of ssh.links.values()) figure.streets.push({ a: ssh.dstates[from].at, b: ssh.dstates[to].at, kind: kindOf(key, null), headed: true, names: [...actions].join(", "), title: `${[...actions].join(", ") || "an action"}: from dstate ${from} to dstate ${to}` });
-  figure.faults = ssh.faults.map(([step, text]) => ({ step, title: text }));
+  figure.faults = ssh.faults.map(([step, text]) => ({ step, disputed: other !== null && !other.faults.some(([, said]) => said === text), title: text }));
   figure.points = [...ssh.places.values(), ...ssh.dstates.filter((s) => s.place === null).map((s) => s.at)];
   figure.layout = ssh.layout;
   figure.labels = ssh.labels;
@@ -402,13 +402,13 @@ function paintFaults(figure, r) {
   const at = new Map();
   for (const fault of figure.faults) {
     const m = figure.marks.find((mark) => mark.steps.includes(fault.step));
-    if (m) at.set(m, [...(at.get(m) ?? []), fault.title]);
+    if (m) at.set(m, [...(at.get(m) ?? []), fault]);
   }
   const u = Math.max(7, r * 0.7);
   for (const [m, told] of at) {
     const far = m.size + u + 5, [x, y] = m.angle === null ? [m.x, m.y - far] : [m.x + m.c * far, m.y + m.s * far];
-    const group = element("svg:g", { class: "fault" }, null, figure.base);
-    element("svg:title", {}, told.join("; "), group);
+    const group = element("svg:g", { class: classes("fault", told.every(({ disputed }) => disputed) && "disputed") }, null, figure.base);
+    element("svg:title", {}, told.map(({ title }) => title).join("; "), group);
     element("svg:path", { d: `M${x},${y - u} l${u},${u} l${-u},${u} l${-u},${-u} Z` }, null, group);
     element("svg:text", { x, y, "font-size": (1.3 * u).toFixed(1) }, "!", group);
   }
@@ -485,13 +485,14 @@ function legend() {
   if (!replay().other) rows.push(["here", "", "where the robot is at this step"]);
   if (replay().beliefs) rows.push(["believed", "", "where it is believed to be: the larger, the more probable"]);
   if (figures.some((figure) => figure.layout?.ellipses?.length)) rows.push(["ellipse", "", "two standard deviations of a position"]);
-  if (data.faults.length) rows.push(["fault", "", "what the map disbelieves"]);
+  if (data.faults.length) rows.push(["fault", "", state.mode === "one" ? "what the map disbelieves" : "what all disbelieve"]);
+  if (data.faults.length && state.mode !== "one") rows.push(["fault", "disputed", state.mode === "two" ? "what the other map does not disbelieve" : "what some maps disbelieve"]);
   for (const [shape, kind, text] of rows) {
     const row = element("p", { class: "key" }, null, $("legend")), svg = element("svg:svg", { viewBox: "0 0 38 16", "aria-hidden": "true" }, null, row);
     if (shape === "street") element("svg:path", { d: "M2,8 H36", class: classes("street", kind), "stroke-width": kind === "order" ? 1.5 : 4 }, null, svg);
     else if (shape === "dstate") element("svg:path", { d: arrowAt(19, 8, 1, 0, 7), class: classes("dstate", kind) }, null, svg);
     else if (shape === "ellipse") element("svg:ellipse", { cx: 19, cy: 8, rx: 14, ry: 6, class: shape }, null, svg);
-    else if (shape === "fault") { const mark = element("svg:g", { class: "fault" }, null, svg); element("svg:path", { d: "M19,0 l8,8 l-8,8 l-8,-8 Z" }, null, mark); element("svg:text", { x: 19, y: 8, "font-size": 11 }, "!", mark); }
+    else if (shape === "fault") { const mark = element("svg:g", { class: classes("fault", kind) }, null, svg); element("svg:path", { d: "M19,0 l8,8 l-8,8 l-8,-8 Z" }, null, mark); element("svg:text", { x: 19, y: 8, "font-size": 11 }, "!", mark); }
     else element("svg:circle", { cx: 19, cy: 8, r: 6, class: shape }, null, svg);
     element("span", {}, text, row);
   }
