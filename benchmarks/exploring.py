@@ -182,7 +182,7 @@ def shortest(world: World) -> int:
     number = {state: n for n, state in enumerate(ends)}
     moves = [Move(number[state], action, number[there], "known") for state in ends for action, there in ends[state].items()]
     travels = {k for k, move in enumerate(moves) if move.action.kind == "travel"}
-    times = shortest_flow(moves, number[world.start], travels, set(number.values()), rounds=1000)
+    times = shortest_flow(moves, number[world.start], travels, set(number.values()), rounds=1000, patience=600)
     assert times is not None
     return sum(times)
 
@@ -358,17 +358,19 @@ def table(records: Sequence[Record]) -> str:
         best = min(steps[strategy] for strategy in STRATEGIES[1:])
         for strategy in STRATEGIES:
             columns[strategy].append(steps[strategy])
-        columns["ratio"].append(steps["explorer"] / best if best < float("inf") else 0.0 if steps["explorer"] < float("inf") else 1.0)
+        columns["ratio"].append(
+            min(steps["explorer"] / best, 99) if best < float("inf") else 0.0 if steps["explorer"] < float("inf") else 1.0
+        )
         some = next(record for record in records if record["world"] == name)
         columns["shortest"].append(some["shortest"])
         said = row["explorer"]
         if "stopped" in said:
             columns["stopped"].append(said["stopped"])
             ends.append(f"{said['ending']}, {'true' if said['true'] else 'not true'}")
-        lines.append(
-            f"| {name} | {some['dstates']} | {some['shortest']} | {' | '.join(_told(steps[s], row[s]) for s in STRATEGIES)} | {columns['ratio'][-1]:.2f} | "
-            f"{said.get('stopped', '')} | {ends[-1] if 'stopped' in said else ''} |"
-        )
+        ratio = f"{columns['ratio'][-1]:.2f}" if columns["ratio"][-1] < 99 else ""
+        told = " | ".join(_told(steps[s], row[s]) for s in STRATEGIES)
+        ending = f"{said['stopped']} | {ends[-1]}" if "stopped" in said else " | "
+        lines.append(f"| {name} | {some['dstates']} | {some['shortest']} | {told} | {ratio} | {ending} |")
     medians = {name: _number(statistics.median(values)) if values else "" for name, values in columns.items()}
     lines.append(
         f"| median of {len(names)} | | {medians['shortest']} | {' | '.join(medians[s] for s in STRATEGIES)} | {statistics.median(columns['ratio']):.2f} | "
@@ -416,7 +418,9 @@ def plot(records: Sequence[Record], file: Path) -> None:
                 )
         axis.set_xticks(range(len(STRATEGIES)), STRATEGIES)
         axis.set_title(f"{family} ({len(runs)})", fontsize=10)
+        axis.set_xlim(-0.5, len(STRATEGIES) - 0.5)
         axis.set_yscale("log")
+        axis.set_ylim(top=max(record["steps"] or 1 for record in records) * 3)  # what never had the map is written above the dots
         axis.grid(axis="y", color="0.9")
     axes[0][0].set_ylabel("steps until the map is unique and true")
     figure.tight_layout()

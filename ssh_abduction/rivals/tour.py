@@ -352,10 +352,15 @@ def _walk(moves: Sequence[Move], start: int, due: set[int], unseen: set[int]) ->
     return tuple(actions)
 
 
-def shortest_flow(moves: Sequence[Move], start: int, due: set[int], unseen: set[int], rounds: int = ROUNDS) -> list[int] | None:
+def shortest_flow(
+    moves: Sequence[Move], start: int, due: set[int], unseen: set[int], rounds: int = ROUNDS, patience: float = PATIENCE
+) -> list[int] | None:
     """How often each move is made on the shortest walk that makes those that are due and gets to what is unseen; None where there is none, or no time.
 
-    After so many rounds it may be the part of such a walk that hangs together with the start.
+    rounds    so often, at most, what is cut off is forbidden
+    patience  seconds for each round; where they are over, the walk may not be the shortest
+
+    After the last round it may be the part of such a walk that hangs together with the start.
     """
     number = {n: i for i, n in enumerate(sorted(_reached(moves, start)))}
     m, size = len(moves), len(number)
@@ -376,7 +381,7 @@ def shortest_flow(moves: Sequence[Move], start: int, due: set[int], unseen: set[
     costs = np.r_[[float(move.cost) for move in moves], np.zeros(size)]
     bounds = Bounds(np.r_[[float(k in due) for k in range(m)], np.zeros(size)], np.r_[np.full(m, float(size)), np.ones(size)])
     for _ in range(rounds):
-        found = milp(costs, constraints=rules, integrality=np.ones(m + size), bounds=bounds, options={"time_limit": PATIENCE})
+        found = milp(costs, constraints=rules, integrality=np.ones(m + size), bounds=bounds, options={"time_limit": patience})
         if found.x is None:
             return None
         times = np.round(found.x[:m]).astype(int)
