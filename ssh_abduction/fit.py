@@ -65,6 +65,9 @@ class _Problem:
         self._from, self._to = labels[self._of_step - 1], labels[self._of_step]
         self._moved = np.array([trace.steps[t].displacement for t in steps], dtype=float).reshape(-1, 3)
         noise = np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
+        # Each dstate has one pose here, so how far off it is taken to be at a visit counts as an error of the displacements to it and from it.
+        travelled = np.array([trace.actions[t - 1].kind != "turn" for t in steps], dtype=float).reshape(-1, 1, 1)
+        noise = noise + travelled * 2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
         self._whitening = np.linalg.inv(np.linalg.cholesky(noise)) if steps else noise
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
         self._sigma = np.array([odometry.scale, odometry.bend])

@@ -40,6 +40,8 @@ class Odometry:
     angle          standard deviation of the heading, in radians, that a step has whatever its length
     scale          how far the scale of all displacements may be wrong, as a share: one unknown for the trace
     bend           how much the heading may drift steadily, in radians a metre: one unknown for the trace
+    offset         standard deviation in x and in y, in metres, of where a dstate is taken to be at each visit, which does not add up along the way
+    facing         the same of its heading, in radians
     """
 
     along: float = 0.05
@@ -50,6 +52,8 @@ class Odometry:
     angle: float = 0.02
     scale: float = 0.05
     bend: float = 0.0035
+    offset: float = 0.0
+    facing: float = 0.0
     extra: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -86,7 +86,8 @@ class Geometry:
         by_heading += noise[-1, -1] * (moves[:2, -1] ** 2).sum()
         bent = 9.0 * variance * by_heading + 1e-6
         missing = any(self.trace.steps[t].displacement is None for t in range(i + 1, j + 1))
-        return off, moves, np.diag([bent, bent, 1e-6]), variance <= 1.0 and not missing
+        offset, facing = 2 * self.odometry.offset**2, 2 * self.odometry.facing**2
+        return off, moves, np.diag([bent + offset, bent + offset, 1e-6 + facing]), variance <= 1.0 and not missing
 
     def refuses(self, returns: tuple[tuple[int, int, int], ...]) -> bool:
         """Whether these returns (two steps, degrees of freedom) are refused together."""

@@ -18,7 +18,13 @@ from ssh_abduction.trace import STANDARD_ACTIONS, Action, Trace
 
 ACTIONS = (*STANDARD_ACTIONS.values(), Action("creep", "travel"), Action("veer", "turn", "right"))
 # Few openings, so that stars often agree: all alike, a straight street, a corner, a dead end, a tee.
-ODOMETRY = ({}, {"scale": 0.0, "bend": 0.0}, {"along": 0.2, "heading": 0.02, "bend": 0.0}, {"bend": 0.02, "position": 0.5})
+ODOMETRY = (
+    {},
+    {"scale": 0.0, "bend": 0.0},
+    {"along": 0.2, "heading": 0.02, "bend": 0.0},
+    {"bend": 0.02, "position": 0.5},
+    {"offset": 0.8, "facing": 0.1},
+)
 STARS = ((1, 1, 1, 1), (1, 0, 1, 0), (1, 1, 0, 0), (1, 0, 0, 0), (1, 1, 1, 0))
 
 

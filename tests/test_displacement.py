@@ -178,7 +178,7 @@ def test_poses_are_where_the_dstates_are() -> None:
 @pytest.mark.parametrize(("factor", "said"), [(0.3, "too loose"), (3.0, "too tight"), (1.0, None)])
 def test_a_noise_model_that_is_off_is_noticed(factor: float, said: str | None) -> None:
     trace = circuit(5, 30, factor, 4)
-    warning = noise_warning(fit(trace, true_circuit(trace, 5)))
+    warning = noise_warning(fit(trace, true_circuit(trace, 5)), trace)
     if said is None:
         assert warning is None
         return

@@ -122,6 +122,9 @@ class _Filter:
         self.repeated = np.zeros((size, 3, 2))  # how the pose moves with the scale, and with the drift
         self.broken = np.zeros(size, dtype=int)  # displacements that are missing so far
         self.sigma = np.array([odometry.scale, drift])
+        self.at_ends = (
+            2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
+        )  # where a dstate is taken to be, at both ends of a loop
         for t in range(1, size):
             x, y, heading = self.pose[t - 1]
             displacement, covariance = trace.steps[t].displacement, trace.covariance(t)
@@ -169,7 +172,7 @@ class _Filter:
         heading = self.lost(first, last)
         moved = self._moved_by_heading(first, last) + (repeated[..., :2, 1] ** 2).sum(-1)
         bent = (SIGMAS / 2) ** 2 * heading * moved + ROUNDED**2
-        added = bent[..., None, None] * np.diag([1.0, 1.0, 0.0]) + ROUNDED**2 * np.diag([0.0, 0.0, 1.0])
+        added = bent[..., None, None] * np.diag([1.0, 1.0, 0.0]) + ROUNDED**2 * np.diag([0.0, 0.0, 1.0]) + self.at_ends
         total: Array = white + repeated @ repeated.swapaxes(-1, -2) + added
         return total
 

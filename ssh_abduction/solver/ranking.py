@@ -85,13 +85,15 @@ def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
     return tuple(weight / sum(likely) for weight in likely)
 
 
-def noise_warning(fit: Fit | None) -> str | None:
+def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
     """What is wrong with the noise that the odometry claims, by how well the best map closes; None where nothing is."""
     if fit is None or fit.dof < 1 or min(fit.p, 1 - fit.p) > DOUBTED / 2:
         return None
     factor = max(math.sqrt(fit.chi2 / fit.dof), NEVER_LESS)
     if 1 / TOO_LARGE < factor < TOO_SMALL:
         return None
+    if factor < 1 and trace.odometry and trace.odometry.offset:
+        return None  # How far off dstates are taken to be counts at each displacement there, which is more than there is.
     how, told = ("smaller", "tight") if factor > 1 else ("larger", "loose")
     return (
         f"the noise model of the odometry is too {told}: the best map closes with a chi-square of {fit.chi2:.0f} where {fit.dof} is expected, "

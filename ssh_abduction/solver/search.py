@@ -580,7 +580,9 @@ class Search:
             trace=self.trace,
             grounding=grounding,
             evidence=said_by(evidence_of(self.theory), self.trace, self._known.refused),
-            odometry_warning=(units_warning(self.trace) or noise_warning(self._first.fit)) if self._first and self._first.fit else None,
+            odometry_warning=(units_warning(self.trace) or noise_warning(self._first.fit, self.trace))
+            if self._first and self._first.fit
+            else None,
         )
 
     def _in_order(self, maps: tuple[SSHMap, ...]) -> tuple[SSHMap, ...]:

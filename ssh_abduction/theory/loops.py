@@ -16,7 +16,8 @@ that comes after it. So to first order it moves the end of the loop by
 
 and the covariance of the closing is the sum of these over the loop (Smith, Self & Cheeseman 1990, "Estimating uncertain spatial relationships in
 robotics"). It is a polynomial in p(j), so that sums from the first step on give it for any loop at once. Two errors repeat, and are unknown numbers of the
-whole trace rather than noise: a wrong scale, and a steady drift of heading.
+whole trace rather than noise: a wrong scale, and a steady drift of heading. What a robot takes for the pose of a dstate may be off by itself at each visit, as where
+the middle of a place is told from laser scans: that adds to the covariance at both ends of the loop, and does not grow along the way.
 
 *Where headings are lost.* First order takes an arc for its tangent. An error of heading that is rare, at SIGMAS standard deviations, bends the way off the tangent by
 half of itself, as a share of what first order says it moves the end by. So much is added to the covariance, in all directions: where the heading is known to a few degrees that
@@ -99,10 +100,10 @@ class Loops:
         covariance = self.noise(i, j) + self.repeated(i, j)
         lost = self._heading_variance(i, j)
         moved_by_heading = self._moved_by_heading(i, j)
-        bent = (SIGMAS / 2) ** 2 * lost * moved_by_heading + ROUNDED**2
+        bent = (SIGMAS / 2) ** 2 * lost * moved_by_heading + ROUNDED**2 + 2 * self.odometry.offset**2
         covariance[:, 0, 0] += bent
         covariance[:, 1, 1] += bent
-        covariance[:, 2, 2] += ROUNDED**2
+        covariance[:, 2, 2] += ROUNDED**2 + 2 * self.odometry.facing**2
         return closing, covariance
 
     def shared(self, loops: tuple[ArrayLike, ArrayLike], others: tuple[ArrayLike, ArrayLike]) -> Array:
