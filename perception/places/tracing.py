@@ -1,0 +1,213 @@
+"""From the visits of a log to a trace: what the robot saw at each dstate, the turns and travels between, displacements and stars."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from perception.places.gateways import apart
+from perception.places.local_map import CELL, LocalMaps, Patch
+from perception.places.scale import Scale
+from perception.places.track import Array, Track, wrapped
+from perception.places.visits import Visit, Way
+from perception.readers.scans import Pose, RobotLog
+from ssh_abduction.odometry import Covariance, Odometry, between, moved
+from ssh_abduction.star import Gateway
+from ssh_abduction.trace import Action, Step, Trace
+
+QUARTER = math.pi / 2
+# A way out that is farther than this from all quarters, in radians, fits no right angle.
+OFF = math.radians(27)
+# A building has right angles if such a share of the ways that the robot took fit them.
+RIGHT = 0.85
+# The walls around a visit tell their direction if they agree with it at least so well.
+AGREE = 0.2
+# How far the middle of a place and the direction of a way are off at one visit, by another: standard deviations in metres and radians.
+MIDDLE, DIRECTION = 0.4, 0.1
+# Besides what matching scans says of itself, each displacement may be off by so much: standard deviations in metres and radians.
+FLOOR = (0.02, 0.02, 0.002)
+# What repeats in a track of matched scans: how far the scale of the odometer is off, as a share, and how the heading drifts, in radians a metre.
+SCALE, DRIFT = 0.01, 0.0003
+# Degrees that the bearing of a gateway may be off.
+SPREAD = 16.0
+# A turn by less than this is none: the way goes on, in radians.
+AHEAD = math.radians(35)
+# An image has a beam in each degree, from the right (-90) to the left (90).
+BEAMS = np.radians(np.arange(-90.0, 91.0))
+
+
+def has_right_angles(visits: Sequence[Visit]) -> bool:
+    """Whether the ways that the robot took meet at right angles, as walls do."""
+    taken = [
+        abs(_off(visit.ways[k].bearing - visit.axis, QUARTER)) < OFF
+        for visit in visits
+        for k in (visit.arrived, visit.left)
+        if k is not None
+    ]
+    return bool(taken) and sum(taken) / len(taken) >= RIGHT
+
+
+def to_trace(log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit], name: str | None = None) -> Trace:
+    """The trace of a log: steps with images, stars and displacements, and the actions between them. Views are left to cluster."""
+    right = has_right_angles(visits)
+    visits = _aligned(visits, QUARTER if right else QUARTER / 2)
+    maps = LocalMaps(log.scans, track, scale.window)
+    steps: list[Step] = []
+    last: tuple[Visit, Pose] | None = None
+    for number, visit in enumerate(visits):
+        patch = maps.around(visit.scan, visit.middle, scale.half)
+        came = None if visit.arrived is None else wrapped(visit.ways[visit.arrived].bearing + math.pi)
+        went = None if visit.left is None else visit.ways[visit.left].bearing
+        # The only visit of a log that neither came from anywhere nor went on faces as the robot did.
+        headings = [heading for heading in (came, went) if heading is not None] or [float(track.poses[visit.scan, 2])]
+        if len(headings) == 2 and apart(*headings) < AHEAD:
+            headings = headings[:1]
+        for heading in headings:
+            pose = (float(visit.middle[0]), float(visit.middle[1]), heading)
+            steps.append(_step(log, track, visit, pose, patch, last, right, number))
+            last = (visit, pose)
+        if steps and number < len(visits) - 1:
+            steps[-1] = replace(steps[-1], action=Action.of("travel"))
+    steps = _with_turns(steps, right)
+    return Trace(
+        tuple(steps),
+        name=name,
+        odometry=Odometry(scale=SCALE, bend=DRIFT, offset=MIDDLE, facing=DIRECTION),
+        extra={"beams": {"first": -90, "step": 1}, "right_angles": right},
+    )
+
+
+def _step(
+    log: RobotLog, track: Track, visit: Visit, pose: Pose, patch: Patch, last: tuple[Visit, Pose] | None, right: bool, number: int
+) -> Step:
+    onward = covariance = None
+    if last is not None:
+        onward = between(last[1], pose)
+        covariance = _covariance(track, last[0].scan, visit.scan, last[1], pose)
+    scan = log.scans[visit.scan]
+    extra: dict[str, object] = {"scan": visit.scan, "visit": number}
+    if scan.time is not None:
+        extra["time"] = scan.time
+    truth = None
+    seen = between(_pose(track, visit.scan), pose)
+    extra["seen"] = [round(x, 4) for x in seen]
+    if scan.corrected is not None:
+        truth = {"pose": [round(x, 4) for x in moved(scan.corrected, seen)]}
+    return Step(
+        image=tuple(round(float(r), 3) for r in _image(patch, visit.middle, pose[2])),
+        star=_star(visit, pose[2], right),
+        displacement=None if onward is None else (round(onward[0], 4), round(onward[1], 4), round(onward[2], 5)),
+        covariance=covariance,
+        truth=truth,
+        extra=extra,
+    )
+
+
+def _aligned(visits: Sequence[Visit], stride: float) -> list[Visit]:
+    """The visits with ways out in multiples of a stride (an angle in radians) from the direction of the walls, so that a way has one direction at each visit.
+
+    A way that is far from all of these is unsure. Where walls tell no direction it is that of the visit before.
+    """
+    aligned: list[Visit] = []
+    axis = next((visit.axis for visit in visits if visit.straight >= AGREE), 0.0)
+    count = round(2 * math.pi / stride)
+    for visit in visits:
+        # Of the directions that a quarter turn makes alike, the one nearest to the last: the axis goes on without jumps.
+        here = visit.axis if visit.straight >= AGREE else axis
+        axis = axis + _off(here - axis, QUARTER)
+        ways: dict[int, Way] = {}
+        number: dict[int, int] = {}
+        for k, way in enumerate(visit.ways):
+            slot = round((way.bearing - axis) / stride) % count
+            sure = way.sure and (abs(_off(way.bearing - axis, stride)) < OFF or k in (visit.arrived, visit.left))
+            ways[slot] = Way(wrapped(axis + slot * stride), sure or (slot in ways and ways[slot].sure))
+            number[k] = slot
+        order = sorted(ways)
+        aligned.append(
+            replace(
+                visit,
+                ways=tuple(ways[slot] for slot in order),
+                arrived=None if visit.arrived is None else order.index(number[visit.arrived]),
+                left=None if visit.left is None else order.index(number[visit.left]),
+                axis=axis,
+            )
+        )
+    return aligned
+
+
+def _off(angle: float, stride: float) -> float:
+    """How far an angle is from the nearest multiple of a stride."""
+    return (angle + stride / 2) % stride - stride / 2
+
+
+def _pose(track: Track, scan: int) -> Pose:
+    x, y, heading = track.poses[scan]
+    return float(x), float(y), float(heading)
+
+
+def _star(visit: Visit, heading: float, right: bool) -> tuple[float | Gateway | None, ...]:
+    """The star of a visit, as it is seen with a heading: bearings in degrees, clockwise."""
+    seen = [(-math.degrees(wrapped(way.bearing - heading)), way.sure) for way in visit.ways]
+    if right:
+        quarters = {round(bearing / 90) % 4: sure for bearing, sure in seen}
+        return tuple((1 if quarters[k] else None) if k in quarters else 0 for k in range(4))
+    return tuple(Gateway(round(bearing, 1), SPREAD, open=True if sure else None) for bearing, sure in sorted(seen))
+
+
+def _image(patch: Patch, middle: Array, heading: float) -> Array:
+    """What a laser in the middle of a place would see, along the path: metres to where free space ends, in each direction, (181,)."""
+    far = np.arange(0.0, min(patch.free.shape) * CELL / 2, CELL / 2)
+    angles = heading + BEAMS
+    cells = np.rint(
+        (middle + far[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :] - patch.corner) / CELL
+    ).astype(int)
+    inside = ((cells >= 0) & (cells < patch.free.shape)).all(axis=2)
+    cells = np.clip(cells, 0, np.array(patch.free.shape) - 1)
+    free = patch.free[cells[..., 0], cells[..., 1]] & inside
+    free[:, : round(2 * CELL / (CELL / 2))] = True
+    return np.asarray(np.where(free.all(axis=1), far[-1], far[np.argmin(free, axis=1)]))
+
+
+def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> Covariance:
+    """The covariance of the displacement from one dstate to the next, in the frame of the first."""
+    if begin > end:
+        begin, end = end, begin
+    total = np.zeros((3, 3))
+    x, y = last[0], last[1]
+    for i in range(begin + 1, end + 1):
+        pose = track.poses[i - 1]
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        # An error of an increment turns and shifts all that comes after it: the end of the way moves with the arm from there.
+        arm = np.array([[cos, -sin, -(y - track.poses[i, 1])], [sin, cos, x - track.poses[i, 0]], [0.0, 0.0, 1.0]])
+        total += arm @ track.covariances[i] @ arm.T
+    turned = np.eye(3)
+    cos, sin = math.cos(first[2]), math.sin(first[2])
+    turned[:2, :2] = [[cos, sin], [-sin, cos]]
+    found = turned @ total @ turned.T
+    found += np.diag(FLOOR) ** 2
+    found = (found + found.T) / 2
+    return tuple(tuple(round(float(v), 8) for v in row) for row in found)  # type: ignore[return-value]
+
+
+def _with_turns(steps: list[Step], right: bool) -> list[Step]:
+    """The steps with the turns between two of one visit."""
+    done = list(steps)
+    for i, step in enumerate(steps[:-1]):
+        if step.action is None:
+            turned = steps[i + 1].displacement
+            assert turned is not None
+            done[i] = replace(step, action=_turn(-math.degrees(turned[2]), right))
+    return done
+
+
+def _turn(degrees: float, right: bool) -> Action:
+    """A turn by degrees, clockwise: to the nearest quarter, or eighth, of a full turn."""
+    stride = 90 if right else 45
+    rounded = round(degrees / stride) * stride % 360
+    names = {90: "right", 180: "around", 270: "left"}
+    if rounded in names:
+        return Action.of(names[rounded])
+    return Action(f"turn {rounded}", "turn", "right" if rounded < 180 else "left", bearing=float(rounded))

@@ -1,0 +1,304 @@
+"""Where a robot's way leads past distinctive places: junctions, corners, dead ends, and where it turned around.
+
+From each milestone of the way the local map is asked for its ways out, and for the point where these part. If three or more ways part there, or the way bends, the milestone votes for
+a place with its middle there. What most milestones nearby vote for is a place, and the robot visits it as it passes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from perception.places.gateways import MERGED, Outlook, apart, nearest, outlook, parting
+from perception.places.local_map import CELL, LocalMaps, Patch
+from perception.places.scale import EVERY, Scale, milestones
+from perception.places.track import Array, Track, surfaces
+from perception.readers.scans import RobotLog
+
+# Two ways out that are straight opposite to within this are one corridor, and no place, in radians.
+BEND = math.radians(40)
+# The robot may be so far from drivable cells, in metres, where the local map is asked.
+ASTRAY = 1.5
+# Shares of the radius: votes within the first are for one middle, the robot passes within the second, and milestones within the third are asked for their votes.
+SAME, PASSING, ASKED = 0.5, 0.6, 0.8
+# At least so many milestones, and such a share of those nearby, have to vote for a place.
+VOTES, AGREED = 3, 0.5
+# The robot turned around where its direction before and after differs by more than this, in radians.
+REVERSED = math.radians(135)
+# And it left a path where its direction differs by more than this between two places.
+BENT = math.radians(65)
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A way out of a place.
+
+    bearing  in radians counterclockwise, in the frame of the track
+    sure     whether it is surely a gateway; if not, it may be none: it is narrow, or leads to where nothing was observed
+    """
+
+    bearing: float
+    sure: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Visit:
+    """The stay at a distinctive place.
+
+    scan      the scan nearest to the middle
+    middle    (x, y) of the middle of the place, in metres in the frame of the track
+    begin     the first scan of the stay
+    end       the last scan of the stay
+    ways      the ways out, counterclockwise
+    arrived   the number of the way by which the robot came, None at the beginning of the log
+    left      the number of the way by which it went, None at the end of the log
+    axis      the direction of the walls, in radians modulo a quarter turn
+    straight  how well the walls agree with that, from 0 to 1
+    support   the share of the milestones nearby that vote for the place
+    """
+
+    scan: int
+    middle: Array
+    begin: int
+    end: int
+    ways: tuple[Way, ...] = ()
+    arrived: int | None = None
+    left: int | None = None
+    axis: float = 0.0
+    straight: float = 0.0
+    support: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Vote:
+    scan: int
+    middle: Array
+
+
+def find_visits(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
+    """The visits of a log, in the order of the way. Corrected poses are not read."""
+    maps = LocalMaps(log.scans, track, scale.window)
+    asked = milestones(track, EVERY)
+    votes = [vote for i in asked if (vote := _vote(maps, track, scale, i)) is not None]
+    found = _supported(votes, asked, track, scale)
+    found = _one_for_each_pass(_with_turnings(found, track, scale), scale)
+    found = _with_bends(found, track, scale)
+    return tuple(_described(visit, log, track, scale, maps) for visit in found)
+
+
+def _vote(maps: LocalMaps, track: Track, scale: Scale, i: int) -> _Vote | None:
+    """The place that can be told from a milestone, if there is one."""
+    patch = maps.around(i, track.poses[i, :2], scale.half)
+    open_cells = patch.drivable(scale.gateway)
+    here = nearest(open_cells, patch.cell(track.poses[i, :2]), ASTRAY)
+    if here is None:
+        return None
+    seen = outlook(open_cells, here, scale.radius)
+    if len(seen.exits) < 2:
+        return None
+    middle = parting(patch, open_cells, seen, scale.radius)
+    if not is_decisive(outlook(open_cells, middle, scale.radius)):
+        return None
+    return _Vote(i, patch.position(middle))
+
+
+def is_decisive(seen: Outlook) -> bool:
+    """Whether there is something to decide: three ways out or more, or a bend."""
+    bearings = seen.bearings
+    return len(bearings) > 2 or (len(bearings) == 2 and math.pi - apart(*bearings) > BEND)
+
+
+def _supported(votes: list[_Vote], asked: list[int], track: Track, scale: Scale) -> list[Visit]:
+    """Places that most of the milestones nearby vote for, each once for each time that the robot passes."""
+    groups: list[list[_Vote]] = []
+    for vote in votes:
+        for group in groups[:-4:-1]:
+            last = track.way[vote.scan] - track.way[group[-1].scan]
+            if last < scale.radius and math.dist(vote.middle, _middle(group)) < SAME * scale.radius:
+                group.append(vote)
+                break
+        else:
+            groups.append([vote])
+    found = []
+    for group in groups:
+        middle = _middle(group)
+        begin, end = _stay(track, middle, group[len(group) // 2].scan, scale.radius)
+        near = [i for i in asked if begin <= i <= end and math.dist(track.poses[i, :2], middle) < ASKED * scale.radius]
+        support = sum(vote.scan in near for vote in group) / max(len(near), 1)
+        scan = begin + int(np.hypot(*(track.poses[begin : end + 1, :2] - middle).T).argmin())
+        if len(group) >= VOTES and support >= AGREED and math.dist(track.poses[scan, :2], middle) < PASSING * scale.radius:
+            found.append(Visit(scan, middle, begin, end, support=support))
+    return sorted(found, key=lambda visit: visit.scan)
+
+
+def _middle(group: list[_Vote]) -> Array:
+    return np.asarray(np.median([vote.middle for vote in group], axis=0))
+
+
+def _stay(track: Track, middle: Array, scan: int, radius: float) -> tuple[int, int]:
+    """The first and the last scan of the stretch around a scan in which the robot is within the radius of a middle, or passes as near as it does."""
+    near = np.hypot(*(track.poses[:, :2] - middle).T)
+    begin = end = scan
+    while begin > 0 and (near[begin - 1] < radius or near[begin - 1] < near[begin]):
+        begin -= 1
+    while end < len(near) - 1 and (near[end + 1] < radius or near[end + 1] < near[end]):
+        end += 1
+    return begin, end
+
+
+def _one_for_each_pass(found: list[Visit], scale: Scale) -> list[Visit]:
+    """Of visits in a row to middles that are too near to be two places the best supported one stays. So does one visit of several to one place without another between."""
+    kept: list[Visit] = []
+    for visit in found:
+        if kept and math.dist(kept[-1].middle, visit.middle) < PASSING * scale.radius:
+            last = kept[-1]
+            best = max((last, visit), key=lambda one: (one.end - one.begin) * one.support)
+            kept[-1] = replace(best, begin=min(last.begin, visit.begin), end=max(last.end, visit.end))
+        else:
+            kept.append(visit)
+    return kept
+
+
+def _with_turnings(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
+    """The visits, and one more wherever the robot turned around away from any of them."""
+    positions, way = track.poses[:, :2], track.way
+    stride = scale.radius / 3
+    turned: list[tuple[float, int]] = []
+    for i in range(len(way)):
+        before, after = np.searchsorted(way, way[i] - stride), np.searchsorted(way, way[i] + stride)
+        if before > 0 or way[i] >= stride:
+            if after >= len(way):
+                break
+            there, back = positions[i] - positions[before], positions[after] - positions[i]
+            if min(math.hypot(*there), math.hypot(*back)) > stride / 2:
+                angle = apart(math.atan2(there[1], there[0]), math.atan2(back[1], back[0]))
+                if angle > REVERSED:
+                    turned.append((angle, i))
+    visits = list(found)
+    for _, i in sorted(turned, reverse=True):
+        if all(
+            math.dist(visit.middle, positions[i]) > scale.radius for visit in visits if abs(way[visit.scan] - way[i]) < 3 * scale.radius
+        ):
+            begin, end = _stay(track, positions[i], i, scale.radius / 2)
+            visits.append(Visit(i, positions[i], begin, end, support=0.0))
+    return sorted(visits, key=lambda visit: visit.scan)
+
+
+def _with_bends(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
+    """The visits, and one more wherever the robot came back, or went on in another direction, without any: a path from one place to the next leads on straight."""
+    positions = track.poses[:, :2]
+    visits: list[Visit] = []
+    for visit in found:
+        if visits:
+            last = visits[-1]
+            went, came = _crossing(track, last, scale.radius, 1), _crossing(track, visit, scale.radius, -1)
+            if went is not None and came is not None and visit.begin > last.end:
+                directions = went - last.middle, visit.middle - came
+                turned = apart(*(math.atan2(y, x) for x, y in directions))
+                between = positions[last.end : visit.begin + 1]
+                # It turned where it was farthest from the straight line between the two places, or, where it came back, from both of them together.
+                line = visit.middle - last.middle
+                length = math.hypot(*line)
+                off = np.hypot(*(between - last.middle).T) + np.hypot(*(between - visit.middle).T)
+                if turned < REVERSED and length > 0:
+                    off = np.abs((between - last.middle) @ np.array([-line[1], line[0]])) / length
+                i = last.end + int(off.argmax())
+                far = min(math.dist(positions[i], one.middle) for one in (last, visit))
+                if turned > BENT and far > scale.radius:
+                    begin, end = _stay(track, positions[i], i, scale.radius / 2)
+                    visits.append(Visit(i, positions[i], max(begin, last.end + 1), min(end, visit.begin - 1), support=0.0))
+        visits.append(visit)
+    return visits
+
+
+def _described(visit: Visit, log: RobotLog, track: Track, scale: Scale, maps: LocalMaps) -> Visit:
+    """The visit with its ways out, those by which the robot came and went, and the direction of the walls."""
+    patch = maps.around(visit.scan, visit.middle, scale.half)
+    ways = _ways(patch, visit.middle, scale)
+    ways, arrived = _taken(ways, _crossing(track, visit, scale.radius, -1), visit.middle)
+    ways, left = _taken(ways, _crossing(track, visit, scale.radius, 1), visit.middle)
+    order = sorted(range(len(ways)), key=lambda k: ways[k].bearing)
+    axis, straight = _walls(log, track, visit)
+    return replace(
+        visit,
+        ways=tuple(ways[k] for k in order),
+        arrived=None if arrived is None else order.index(arrived),
+        left=None if left is None else order.index(left),
+        axis=axis,
+        straight=straight,
+    )
+
+
+def _ways(patch: Patch, middle: Array, scale: Scale) -> list[Way]:
+    """The ways out that are seen from a middle: those that are surely gateways, and those that may be some."""
+    sure = _outlook(patch, middle, scale.gateway, scale.radius)
+    ways = [Way(bearing) for bearing in (sure.bearings if sure else ())]
+    doubtful = _outlook(patch, middle, scale.doubtful, scale.radius)
+    if doubtful is None:
+        return ways
+    for bearing in (*doubtful.bearings, *_unseen(patch, doubtful, scale)):
+        if all(apart(bearing, way.bearing) > MERGED for way in ways):
+            ways.append(Way(bearing, sure=False))
+    return ways
+
+
+def _outlook(patch: Patch, middle: Array, width: float, radius: float) -> Outlook | None:
+    open_cells = patch.drivable(width)
+    here = nearest(open_cells, patch.cell(middle), ASTRAY)
+    return None if here is None else outlook(open_cells, here, radius)
+
+
+def _unseen(patch: Patch, seen: Outlook, scale: Scale) -> list[float]:
+    """Bearings at which drivable space ends, within the radius, because nothing was observed beyond, over the width of a gateway or more."""
+    unknown = ~patch.free & ~patch.occupied
+    # Cells next to a wall also border on what is behind it: the border to the unknown counts only away from what was met.
+    border = ndimage.binary_dilation(unknown, iterations=2) & patch.free & (patch.room > scale.doubtful / 2)
+    border &= ndimage.binary_dilation(np.isfinite(seen.reached), iterations=round(scale.doubtful / CELL))
+    parts, count = ndimage.label(border, np.ones((3, 3), bool))
+    found = []
+    for k in range(1, count + 1):
+        cells = np.argwhere(parts == k)
+        if np.ptp(cells, axis=0).max() * CELL >= scale.gateway:
+            row, column = cells.mean(axis=0) - seen.middle
+            if math.hypot(row, column) * CELL > scale.gateway:
+                found.append(math.atan2(column, row))
+    return found
+
+
+def _crossing(track: Track, visit: Visit, radius: float, side: int) -> Array | None:
+    """Where the robot came into the radius of a place (side -1), or went out of it (side 1); None where the log begins or ends before that."""
+    positions = track.poses[:, :2]
+    i = visit.begin if side < 0 else visit.end
+    near = math.dist(positions[i], visit.middle)
+    last = 0 if side < 0 else len(positions) - 1
+    while near < 0.9 * radius:
+        if i == last:
+            return positions[i] if near > 0.5 * radius else None
+        i += side
+        near = math.dist(positions[i], visit.middle)
+    return np.asarray(positions[i])
+
+
+def _taken(ways: list[Way], crossing: Array | None, middle: Array) -> tuple[list[Way], int | None]:
+    """The ways out, and the number of the one by which the robot went: it is surely a gateway, and if none was seen in that direction, there is one."""
+    if crossing is None:
+        return ways, None
+    bearing = math.atan2(*(crossing - middle)[::-1])
+    k = min(range(len(ways)), key=lambda k: apart(ways[k].bearing, bearing), default=None)
+    if k is None or apart(ways[k].bearing, bearing) > 2 * MERGED:
+        return [*ways, Way(bearing)], len(ways)
+    return [replace(way, sure=True) if i == k else way for i, way in enumerate(ways)], k
+
+
+def _walls(log: RobotLog, track: Track, visit: Visit) -> tuple[float, float]:
+    """The direction of the walls around a visit, modulo a quarter turn, and how well they agree with it."""
+    total, count = 0j, 0
+    for i in range(visit.begin, visit.end + 1):
+        _, normals = surfaces(log.scans[i])
+        angles = np.arctan2(normals[:, 1], normals[:, 0]) + track.poses[i, 2]
+        total += np.exp(4j * angles).sum()
+        count += len(angles)
+    return float(np.angle(total)) / 4, abs(total) / max(count, 1)
