@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ssh_abduction.evaluation import Evaluation, evaluate
+from ssh_abduction.evaluation import Evaluation, evaluate, tells_names
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -59,10 +59,11 @@ class Rung:
 
 def rungs(trace: Trace, theory: Theory) -> Iterator[tuple[str, Theory]]:
     """The theories of the ladder, each with one kind of evidence more, as far as the trace has it."""
+    uses_stars = theory.star != "none"
     jumped, theory = theory.jumped, theory.replace(star="none", displacement="none", planar=False, jumped=0)
     yield "views", theory
     topological = theory.level == "topological"
-    if trace.has_stars:
+    if trace.has_stars and uses_stars:
         theory = theory.replace(star="auto" if topological else "alike")
         yield "+ star", theory
     if trace.has_displacements:
@@ -82,7 +83,7 @@ def ladder(trace: Trace, theory: Theory | None = None, *, limit: float | None = 
     maps    so many minimal maps, at most, are listed and evaluated on each rung
     """
     checked_trace(trace)
-    has_truth = any(step.truth is not None for step in trace)
+    has_truth = tells_names(trace)
     for name, chosen in rungs(trace, checked_theory(theory)):
         solution = solve(trace, chosen, limit=limit, maps=maps)
         yield Rung(name, solution, evaluate(solution.maps, trace) if has_truth and solution.maps else None)

@@ -175,7 +175,7 @@ def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler:
     deadly = Deadly(*(getattr(QUESTION, name) for name in Question.__slots__))
     paths = [f"{name}.jsonl" for name in ("quick", "deadly", "comb", "quick")]
     stop = Stop(traces / "stop")
-    for answers in (batch._here(deadly, paths, 2, stop), batch._on_cluster(deadly, paths, scheduler, None, stop)):
+    for answers in (batch.here(deadly, paths, 2, stop), batch.on_cluster(deadly, paths, scheduler, None, stop)):
         lines = {answer.number: answer.line for answer in answers}
         assert sorted(lines) == [*range(len(paths))]
         for number, path in enumerate(paths):
@@ -185,12 +185,12 @@ def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler:
 def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler: str) -> None:
     theory = Theory.topological().replace(boundary="none", path_order="partial", prefer=())
     endless = Question(theory, limit=30, maps=0, memory=None, speedups=Speedups(), json=False)
-    answers = batch._on_cluster(endless, ["quick.jsonl", "slow.jsonl"], scheduler, None, Stop(traces / "stop"))
+    answers = batch.on_cluster(endless, ["quick.jsonl", "slow.jsonl"], scheduler, None, Stop(traces / "stop"))
     assert next(answers).number == 0
     time.sleep(0.5)  # the only thread of the worker is at the slow one
     answers.close()
     began = time.monotonic()
-    assert [answer.code for answer in batch._on_cluster(QUESTION, ["comb.jsonl"], scheduler, None, Stop(traces / "stop"))] == [0]
+    assert [answer.code for answer in batch.on_cluster(QUESTION, ["comb.jsonl"], scheduler, None, Stop(traces / "stop"))] == [0]
     assert time.monotonic() - began < 15
 
 
@@ -211,7 +211,7 @@ def test_ctrl_c_prints_what_waited_for_its_turn(traces: Path, monkeypatch: pytes
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(10)
 
-    monkeypatch.setattr(batch, "_here", answers)
+    monkeypatch.setattr(batch, "here", answers)
     assert main(["solve", *["quick.jsonl"] * 5]) == 130
     assert capsys.readouterr() == ("first\nthird\nfourth\n", "ssh-abduction: interrupted: 2 of 5 traces not finished\n")
 

@@ -28,6 +28,7 @@ from ssh_abduction.cli import (
     explain,
     export,
     facts,
+    import_log,
     ladder,
     localize,
     next_experiment,
@@ -39,6 +40,7 @@ from ssh_abduction.cli import (
     train,
     view,
 )
+from ssh_abduction.cli import map as map_logs
 from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.verbosity import add_verbosity, telling
 from ssh_abduction.errors import SSHError, named, printable
@@ -118,6 +120,8 @@ def parser() -> argparse.ArgumentParser:
         facts,
         theory,
         simulate,
+        import_log,
+        map_logs,
         cluster,
         train,
         view,

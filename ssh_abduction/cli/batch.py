@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 from ssh_abduction.asp.limits import Stop as SearchStop
 from ssh_abduction.cli import EXIT_ERROR, EXIT_INTERRUPTED, workers
@@ -90,6 +90,30 @@ class Stop:
         return self.file.exists()
 
 
+class Asked(Protocol):
+    """What is asked about each of many files. Plain data, as it travels to other processes and machines; so are its answers, which have the number of their file."""
+
+    @property
+    def overdue(self) -> float | None:
+        """Seconds after which a process that was to answer is taken for lost."""
+
+    @property
+    def has_limits(self) -> bool:
+        """Whether it takes a process of its own to answer, as that may have to be ended."""
+
+    def load(self, path: str) -> Any:
+        """What goes along to a worker. Whatever it raises is the answer."""
+
+    def answer(self, number: int, path: str, content: Any, given_up: Callable[[], bool]) -> Any:
+        """The answer for a file, read here if its content did not come along."""
+
+    def lost(self, lost: workers.Lost, path: str) -> Any:
+        """The answer for a file whose process ended without one."""
+
+    def failed(self, number: int, path: str, error: Exception) -> Any:
+        """The answer for a file with which something went wrong."""
+
+
 @dataclass(frozen=True, slots=True)
 class Question:
     """What is asked about each trace: limit, maps, within, memory and speedups as of Search. Plain data, as it travels to other processes and machines."""
@@ -101,6 +125,15 @@ class Question:
     speedups: Speedups
     json: bool
     within: int = 0
+
+    @property
+    def has_limits(self) -> bool:
+        """Whether it takes a process of its own to answer, as that may have to be ended."""
+        return self.limit is not None or self.memory is not None
+
+    def load(self, path: str) -> Trace:
+        """What goes along to a worker: the trace, so that workers need not share the disk."""
+        return Trace.load(path)
 
     def answer(self, number: int, path: str, trace: Trace | None = None, given_up: Callable[[], bool] = lambda: False) -> Answer:
         """Solve a trace, read from its file if it did not come along. Whatever goes wrong is the answer. Stops when it is given up."""
@@ -198,9 +231,9 @@ def run(options: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as folder:
         stop = Stop(Path(folder) / "stop")
         if options.scheduler is None:
-            answers = _here(question, paths, options.jobs or 1, stop)
+            answers = here(question, paths, options.jobs or 1, stop)
         else:
-            answers = _on_cluster(question, paths, options.scheduler, options.jobs, stop)
+            answers = on_cluster(question, paths, options.scheduler, options.jobs, stop)
         codes = _printed(answers, len(paths), stop)
         stopped = stop.is_set()
     if stopped:
@@ -238,11 +271,11 @@ def _printed(answers: Generator[Answer], total: int, stop: Stop) -> list[int]:
     return codes
 
 
-def _solved_in_worker(number: int, path: str, question: Question, given_up: Callable[[], bool]) -> Answer:
+def _solved_in_worker(number: int, path: str, question: Asked, given_up: Callable[[], bool]) -> Any:
     return question.answer(number, path, None, given_up)
 
 
-def _here(question: Question, paths: Sequence[str], jobs: int, stop: Stop) -> Generator[Answer]:
+def here(question: Asked, paths: Sequence[str], jobs: int, stop: Stop) -> Generator[Any]:
     """Answers from processes of this machine. Once it is to stop, those of traces under way, as far as these are.
 
     A process that is killed loses its trace alone. These processes do not hear Ctrl-C themselves: they are told of it.
@@ -262,7 +295,7 @@ def _here(question: Question, paths: Sequence[str], jobs: int, stop: Stop) -> Ge
             yield question.lost(answer, paths[answer.number]) if isinstance(answer, workers.Lost) else answer
 
 
-def _on_cluster(question: Question, paths: Sequence[str], address: str, jobs: int | None, stop: Stop) -> Generator[Answer]:
+def on_cluster(question: Asked, paths: Sequence[str], address: str, jobs: int | None, stop: Stop) -> Generator[Any]:
     """Answers from the workers of a Dask scheduler."""
     try:
         from distributed import Client
@@ -288,7 +321,7 @@ def _on_cluster(question: Question, paths: Sequence[str], address: str, jobs: in
                 return
 
 
-def _answers(question: Question, paths: Sequence[str], attempt: Callable[[list[Task], list[Task]], Iterator[Answer]]) -> Iterator[Answer]:
+def _answers(question: Asked, paths: Sequence[str], attempt: Callable[[list[Task], list[Task]], Iterator[Any]]) -> Iterator[Any]:
     """Answers as they are ready, in any order.
 
     `attempt` yields the answers for some traces, and puts those under way while a process was killed into its second list. Which of them was
@@ -303,17 +336,17 @@ def _answers(question: Question, paths: Sequence[str], attempt: Callable[[list[T
             yield question.failed(*task, SolverError(KILLED))
 
 
-def _on_workers(question: Question, client: Client, most: int, tasks: list[Task], killed: list[Task]) -> Iterator[Answer]:
+def _on_workers(question: Asked, client: Client, most: int, tasks: list[Task], killed: list[Task]) -> Iterator[Any]:
     """An attempt on Dask, with so many traces at most sent at a time. They are read here: workers need not share the disk.
 
     This is Dask's own interface, as joblib's backend for Dask waits for ever when a worker is killed.
     """
     from distributed import KilledWorker, as_completed
 
-    sent: dict[Future[Answer], Task] = {}
+    sent: dict[Future[Any], Task] = {}
     ready = as_completed(loop=client.loop)
 
-    def received(futures: Iterable[Future[Answer]]) -> Iterator[Answer]:
+    def received(futures: Iterable[Future[Any]]) -> Iterator[Any]:
         for future in futures:
             task = sent.pop(future)
             try:
@@ -330,7 +363,7 @@ def _on_workers(question: Question, client: Client, most: int, tasks: list[Task]
         try:
             if client.status != "running":
                 raise SolverError(LOST)
-            future = client.submit(_on_worker, question, number, path, Trace.load(path), pure=False)
+            future = client.submit(_on_worker, question, number, path, question.load(path), pure=False)
         except Exception as error:
             yield question.failed(number, path, error)
             continue
@@ -342,7 +375,7 @@ def _on_workers(question: Question, client: Client, most: int, tasks: list[Task]
         yield question.failed(*task, SolverError(LOST))
 
 
-def _on_worker(question: Question, number: int, path: str, trace: Trace) -> Answer:
+def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
     """The answer, on a Dask worker. A worker runs on when its client has gone, so the search looks now and then whether it has."""
     from distributed import get_worker
 
@@ -352,16 +385,16 @@ def _on_worker(question: Question, number: int, path: str, trace: Trace) -> Answ
     def given_up() -> bool:
         return bool(task.state == "cancelled")
 
-    if question.limit is None and question.memory is None:
-        return question.answer(number, path, trace, given_up)
+    if not question.has_limits:
+        return question.answer(number, path, content, given_up)
     # Other traces may be under way in this process, which cannot be ended with one that does not heed its limits.
-    work = [(number, path, question, trace)]
-    answer: Answer | workers.Lost = next(workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, OVERDUE))
+    work = [(number, path, question, content)]
+    answer: Any = next(workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, OVERDUE))
     return question.lost(answer, path) if isinstance(answer, workers.Lost) else answer
 
 
-def _solved_for_cluster(number: int, path: str, question: Question, trace: Trace, given_up: Callable[[], bool]) -> Answer:
-    return question.answer(number, path, trace, given_up)
+def _solved_for_cluster(number: int, path: str, question: Asked, content: Any, given_up: Callable[[], bool]) -> Any:
+    return question.answer(number, path, content, given_up)
 
 
 def _forget_memory() -> None:

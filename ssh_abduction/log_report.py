@@ -1,0 +1,242 @@
+"""The report of a run: the map over the laser scans, what each kind of evidence is worth, what is disbelieved, the rivals, and how long each stage took.
+
+Scans are laid at corrected poses where the log has them, for the reader's eye alone: the map was made without.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from html import escape
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.places.importing import Imported
+from perception.readers.scans import Pose, RobotLog
+from ssh_abduction.drawing import COLOURS, page, text
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.odometry import between, moved
+from ssh_abduction.rungs import Rung
+from ssh_abduction.solver.result import Solution
+
+Array = NDArray[np.float64]
+Point = tuple[float, float]
+
+# The picture has one point of a wall in each square of so many metres.
+GRAIN = 0.2
+# So many units of the page are a metre; the picture is made smaller where it would be larger than this.
+METRE, LARGEST = 14.0, 1500.0
+# Beams farther than this are left out of the picture, in metres: they are too far from each other to draw a wall.
+DRAWN = 12.0
+
+STYLE = """
+:root { color-scheme: light dark; --ink: #1c1c1c; --paper: #ffffff; --line: #c8c8c8 }
+@media (prefers-color-scheme: dark) { :root { --ink: #e6e6e6; --paper: #16181c; --line: #44484f } }
+body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 70rem; margin: 2rem auto; padding: 0 1rem }
+table { border-collapse: collapse; display: block; overflow-x: auto } th, td { border-bottom: 1px solid var(--line); padding: .2rem .8rem .2rem 0; text-align: left }
+figure { margin: 1rem 0; background: white; border: 1px solid var(--line) } figure svg { width: 100%; height: auto; display: block } figcaption { color: #333; padding: .4rem .6rem }
+code { overflow-wrap: anywhere }
+"""
+
+
+def report(log: RobotLog, imported: Imported, solution: Solution, rungs: Sequence[Rung], run: Mapping[str, Any]) -> str:
+    """The page, as HTML that loads nothing.
+
+    run  what run.json holds
+    """
+    name = imported.trace.name or "log"
+    parts = [
+        f"<h1>{escape(name)}</h1>",
+        f"<p>{escape(_summary(solution, run))}</p>",
+        _figure(log, imported, solution),
+        "<h2>What each kind of evidence is worth</h2>" + _ladder(rungs) if rungs else "",
+        "<h2>Rival maps</h2>" + _paragraph(solution.summary or "There is no other minimal map.") if solution.maps else "",
+        "<h2>What the map disbelieves</h2>" + _faults(solution) if solution.maps else "",
+        "<h2>Settings</h2>" + _settings(run),
+        "<h2>Time</h2>" + _time(run),
+        "<h2>The log</h2>" + _log(log, run),
+        "<h2>Visits</h2>" + _visits(imported, solution),
+    ]
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f"<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">"
+        f"<title>{escape(name)}</title><style>{STYLE}</style>\n" + "\n".join(part for part in parts if part) + "\n</html>\n"
+    )
+
+
+def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
+    log, cost = run["log"], solution.cost
+    seen = f"{log['scans']} scans on a way of {log['metres']:g} m; {run['visits']} visits to distinctive places, {run['steps']} steps."
+    if cost is None:
+        return f"{seen} No map of them: {solution.status.value}."
+    of = (
+        "one minimal map"
+        if solution.complete and solution.count == 1
+        else f"{'' if solution.complete else 'at least '}{solution.count} minimal maps"
+    )
+    proven = of if solution.status.value == "optimal" else "a map without a proof that it is minimal"
+    return f"{seen} {cost.places} places, {cost.paths} paths, {cost.dstates} distinctive states: {proven}."
+
+
+def _figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
+    """The map over the scans."""
+    corrected = all(scan.corrected is not None for scan in log.scans)
+    poses: list[Pose] = (
+        [scan.corrected or (0.0, 0.0, 0.0) for scan in log.scans] if corrected else [_pose(row) for row in imported.track.poses]
+    )
+    walls = _walls(log, poses)
+    spots = {
+        number: moved(poses[visit.scan], between(_pose(imported.track.poses[visit.scan]), (*_xy(visit.middle), 0.0)))[:2]
+        for number, visit in enumerate(imported.visits)
+    }
+    extent = np.ptp(np.concatenate([walls, [p[:2] for p in poses]]), axis=0).max() if len(walls) else 1.0
+    unit = min(METRE, LARGEST / max(float(extent), 1.0))
+
+    def on_page(point: Sequence[float]) -> Point:
+        return point[0] * unit, -point[1] * unit
+
+    dots = "".join(f"M{x * unit:.0f} {-y * unit:.0f}h0" for x, y in walls)
+    way = " ".join(f"{x:.1f},{y:.1f}" for x, y in (on_page(pose[:2]) for pose in poses))
+    marks = [
+        f'<path d="{dots}" stroke="#9a9a9a" stroke-width="{max(GRAIN * unit * 0.7, 1):.1f}" stroke-linecap="round" fill="none"/>',
+        f'<polyline points="{way}" fill="none" stroke="#b9c7d6" stroke-width="1"/>',
+        *_streets(imported, solution.maps[0] if solution.maps else None, {n: on_page(p) for n, p in spots.items()}),
+    ]
+    poses_said = "corrected poses of the log, which were not read for the map" if corrected else "the poses of the track, which drifts"
+    points = [on_page(p) for p in walls] + [on_page(p[:2]) for p in poses]
+    picture = page(marks, points or [(0.0, 0.0)], margin=20)
+    return f"<figure>{picture}<figcaption>The {'first map' if solution.maps else 'visits'} over the scans, at {poses_said}. Numbers are places; small dots are visits.</figcaption></figure>"
+
+
+def _streets(imported: Imported, ssh_map: SSHMap | None, spots: Mapping[int, Point]) -> Iterator[str]:
+    """The streets between visits, and the places: each in the mean of where it was visited."""
+    trace = imported.trace
+    if ssh_map is None:
+        yield from (f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="#d55e00"/>' for x, y in spots.values())
+        return
+    of_label = {state.id: state for state in ssh_map.dstates}
+    visit_of = [int(step.extra["visit"]) for step in trace.steps]
+    place_of = {visit: of_label[label].place for visit, label in zip(visit_of, ssh_map.labels, strict=True)}
+    visited: dict[int | None, list[Point]] = {}
+    for visit, place in place_of.items():
+        visited.setdefault(place, []).append(spots[visit])
+    middle = {place: (float(np.mean([x for x, _ in at])), float(np.mean([y for _, y in at]))) for place, at in visited.items()}
+    for (t, before), (_, after) in pairwise(enumerate(ssh_map.labels)):
+        if trace.actions[t].kind == "travel":
+            a, b, path = middle[of_label[before].place], middle[of_label[after].place], of_label[before].path
+            colour = COLOURS[(path or 0) % len(COLOURS)]
+            yield f'<path d="M{a[0]:.1f} {a[1]:.1f}L{b[0]:.1f} {b[1]:.1f}" stroke="{colour}" stroke-width="5" stroke-opacity=".75" fill="none"/>'
+    yield from (f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="#444"/>' for x, y in spots.values())
+    for place, (x, y) in middle.items():
+        if place is not None:
+            yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="11" fill="white" stroke="#222" stroke-width="2"/>' + text(
+                x, y, str(place), "#222", 12, "bold"
+            )
+
+
+def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
+    """A point in each square of GRAIN metres in which some beam ended."""
+    found = []
+    for scan, pose in zip(log.scans, poses, strict=True):
+        x, y, heading = moved(pose, scan.laser.mount)
+        near = np.isfinite(scan.ranges) & (scan.ranges < min(DRAWN, scan.laser.reach))
+        angles = heading + scan.laser.bearings[near]
+        found.append(np.stack([x + scan.ranges[near] * np.cos(angles), y + scan.ranges[near] * np.sin(angles)], axis=1))
+    cells = np.rint(np.concatenate(found) / GRAIN).astype(int)
+    kept, counts = np.unique(cells, axis=0, return_counts=True)
+    return np.asarray(kept[counts > (1 if len(log) > 100 else 0)] * GRAIN)
+
+
+def _ladder(rungs: Sequence[Rung]) -> str:
+    rows = []
+    for rung in rungs:
+        cost = rung.solution.cost
+        counts = (cost.dstates, cost.places, cost.paths) if cost else ("–", "–", "–")
+        rows.append((rung.name, rung.solution.status.value, *counts, f"{rung.solution.seconds.total:.1f} s"))
+    return _table(("evidence", "status", "dstates", "places", "paths", "time"), rows)
+
+
+def _faults(solution: Solution) -> str:
+    faults = solution.maps[0].faults
+    if not faults:
+        allowed = solution.theory.misread or solution.theory.slipped or solution.theory.jumped
+        return _paragraph("Nothing." if allowed else "Nothing: the theory allows no faults (--misread 4 would).")
+    return _table(("step", "what", "seen", "cost"), [(f.step, f.kind, f.seen, f.cost) for f in faults])
+
+
+def _settings(run: Mapping[str, Any]) -> str:
+    theory = ", ".join(f"{name} {value}" for name, value in run["theory"].items() if value not in (None, False, [], 0))
+    rows = [
+        ("gateway", f"{run['scale']['gateway']:g} m", "the least width of a way out that counts"),
+        ("radius", f"{run['scale']['radius']:g} m", "how far a way out must lead from the middle of a place"),
+        ("walls", "right angles" if run["right_angles"] else "any angles", "as the ways that the robot took suggest"),
+        ("theory", theory, "the axioms, and the choices in them"),
+    ]
+    return _table(("", "", ""), rows)
+
+
+def _time(run: Mapping[str, Any]) -> str:
+    total = math.fsum(run["seconds"].values())
+    rows = [(stage, f"{seconds:.2f} s", f"{100 * seconds / max(total, 1e-9):.0f} %") for stage, seconds in run["seconds"].items()]
+    told = ""
+    if run["drove"]:
+        told = _paragraph(
+            f"The robot drove {run['drove']:.0f} s. All stages together took {total:.1f} s of processor time, a share of 1/{run['drove'] / max(total, 1e-9):.0f}."
+        )
+    return _table(("stage", "processor", "share"), rows) + told
+
+
+def _log(log: RobotLog, run: Mapping[str, Any]) -> str:
+    said = [f"{log.source}: {log.format}, {len(log)} scans.", *log.notes]
+    if log.damaged:
+        said.append(f"{len(log.damaged)} damaged parts were skipped; the first ones:")
+        said += [f"{damage.line}: {damage.what}" for damage in log.damaged[:10]]
+    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in said) + "</ul>"
+
+
+def _visits(imported: Imported, solution: Solution) -> str:
+    labels = solution.maps[0].labels if solution.maps else None
+    states = {state.id: state for state in solution.maps[0].dstates} if solution.maps else {}
+    rows = []
+    for t, step in enumerate(imported.trace.steps):
+        state = states[labels[t]] if labels else None
+        star = " ".join(
+            "?" if entry is None else f"{entry:g}" if isinstance(entry, int | float) else f"{entry.bearing:g}°{'' if entry.open else '?'}"
+            for entry in step.star or ()
+        )
+        rows.append(
+            (
+                t,
+                step.extra["visit"],
+                step.extra["scan"],
+                step.view,
+                star,
+                step.action.name if step.action else "",
+                state.id if state else "–",
+                "–" if state is None or state.place is None else state.place,
+            )
+        )
+    return _table(("step", "visit", "scan", "view", "star", "action", "dstate", "place"), rows)
+
+
+def _table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
+    titles = "".join(f"<th>{escape(str(cell))}</th>" for cell in head)
+    body = "".join("<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table><tr>{titles}</tr>{body}</table>"
+
+
+def _paragraph(told: str) -> str:
+    return f"<p>{escape(told)}</p>"
+
+
+def _pose(row: Array) -> Pose:
+    x, y, heading = row
+    return float(x), float(y), float(heading)
+
+
+def _xy(middle: Array) -> Point:
+    x, y = middle
+    return float(x), float(y)

@@ -1,0 +1,138 @@
+"""From a robot's log to the map of a building: on logs that the simulator writes, and on real ones where they are."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.errors import LogError
+from perception.places.importing import import_log
+from perception.places.local_map import CELL, distances
+from perception.places.track import follow
+from perception.readers.logs import read_log
+from perception.readers.scans import Laser, RobotLog, Scan
+from ssh_abduction import Theory
+from ssh_abduction.cli import main
+from ssh_abduction.evaluation import evaluate_visits
+from ssh_abduction.log_maps import map_log
+from ssh_abduction.odometry import between
+from ssh_abduction.solver.result import Solution
+from ssh_abduction.trace import Trace
+
+REAL = Path(__file__).parents[2] / "shared" / "data" / "logs"
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One tour through the hallway, as a CARMEN log."""
+    path = tmp_path_factory.mktemp("logs") / "hall.log"
+    assert main(["simulate", "taylor-hall", "--as", "carmen", "--seed", "3", "-q", "-o", str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def runs(hall: Path) -> Path:
+    """What `map` writes of it, and of a log that cannot be read."""
+    bad = hall.with_name("bad.log")
+    bad.write_text("nothing\n")
+    assert main(["map", str(hall), str(bad), "-o", str(hall.parent / "runs"), "--no-ladder", "--time-limit", "40"]) == 1
+    return hall.parent / "runs"
+
+
+def test_scans_mend_the_odometry(hall: Path) -> None:
+    log = read_log(hall)
+    track = follow(log)
+    true = [scan.corrected for scan in log.scans]
+
+    def off(poses: object, i: int, j: int) -> float:
+        went = between(between(true[i], true[j]), between(tuple(poses[i]), tuple(poses[j])))  # type: ignore[index, arg-type]
+        return math.hypot(*went[:2])
+
+    last = len(log) - 1
+    assert off(track.poses, 0, last) < 0.3 * off([scan.odometry for scan in log.scans], 0, last)
+    closing = np.array([track.covariances[i] for i in range(1, len(log))])
+    assert np.allclose(closing, closing.swapaxes(1, 2))
+    assert (np.linalg.eigvalsh(closing) > 0).all()
+
+
+def test_a_drive_becomes_a_trace_of_the_places_it_passed(runs: Path) -> None:
+    trace = Trace.load(runs / "hall" / "trace.jsonl")
+    assert trace.extra["right_angles"] is True
+    # Each visit has one step or two: the robot goes on straight, or it turns.
+    visits = [step.extra["visit"] for step in trace]
+    assert visits == sorted(visits)
+    assert max(visits.count(visit) for visit in set(visits)) == 2
+    for i, action in enumerate(trace.actions):
+        assert (action.kind == "turn") == (visits[i] == visits[i + 1])
+    # What the robot took for its way agrees with where it was: within a few standard deviations of the displacement.
+    for i, (before, after) in enumerate(zip(trace.steps[:-1], trace.steps[1:], strict=True)):
+        error = np.array(between(between(before.truth["pose"], after.truth["pose"]), after.displacement))
+        covariance = np.array(trace.covariance(i + 1))
+        assert error @ np.linalg.solve(covariance, error) < 30
+
+
+def test_the_map_of_a_drive_joins_what_is_one_place(runs: Path) -> None:
+    folder = runs / "hall"
+    assert {path.name for path in folder.iterdir()} == {"trace.jsonl", "maps.json", "page.html", "report.html", "run.json"}
+    (judged,) = evaluate_visits(Solution.load(folder / "maps.json").maps[:1], Trace.load(folder / "trace.jsonl")).maps
+    assert (judged.places.precision, judged.places.recall) == (1.0, 1.0)
+    run = json.loads((folder / "run.json").read_text())
+    assert set(run["seconds"]) >= {"track", "places", "trace", "views", "maps"}
+    assert "<script" not in (folder / "report.html").read_text()
+
+
+def test_corrected_poses_are_not_read(hall: Path) -> None:
+    log = RobotLog(read_log(hall).scans[:250], source="x")
+    blind = tuple(Scan(scan.ranges, scan.laser, scan.odometry, None, scan.time, scan.line) for scan in log.scans)
+    seen, unseen = (import_log(RobotLog(scans, source="x")).trace for scans in (log.scans, blind))
+    assert [(s.view, s.star, s.displacement, s.action) for s in seen] == [(s.view, s.star, s.displacement, s.action) for s in unseen]
+    assert not any(step.truth for step in unseen)
+
+
+def test_a_log_of_a_robot_that_stands_or_passes_nothing_is_an_error() -> None:
+    laser = Laser(-math.pi / 2, math.radians(1), 181, 30.0)
+    corridor = np.minimum(1.0 / np.maximum(np.abs(np.sin(laser.bearings)), 1e-9), 30.0)
+    still = [Scan(corridor, laser, (0.0, 0.0, 0.0))] * 3
+    with pytest.raises(LogError, match="expected a robot that drives"):
+        import_log(RobotLog(tuple(still), source="still.log"))
+    onward = [Scan(np.where(corridor >= 30, np.inf, corridor), laser, (0.5 * i, 0.0, 0.0)) for i in range(30)]
+    with pytest.raises(LogError, match="expected a way past junctions, corners or dead ends"):
+        import_log(RobotLog(tuple(onward), source="corridor.log"))
+
+
+def test_waves_go_around_walls() -> None:
+    room = np.ones((41, 41), bool)
+    room[20, :35] = False
+    seed = np.zeros_like(room)
+    seed[10, 5] = True
+    found = distances(room, seed, 20.0)
+    assert found[10, 35] == pytest.approx(30 * CELL, rel=0.1)
+    assert found[30, 5] > 2 * 29 * CELL  # through the gap at the right end
+    assert math.isinf(distances(room, seed, 1.0)[10, 35])
+
+
+def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(hall: Path, runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = hall.with_name("bad.log")
+    assert main(["map", str(hall), str(bad), "-o", str(runs), "--no-ladder", "--time-limit", "40"]) == 1
+    told = capsys.readouterr()
+    assert f"{hall}: done already, in {runs / 'hall'}" in told.out
+    assert f"{bad}: expected a robot's log" in told.out
+    assert "errors in 1 of 1 logs" in told.err
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="real logs are not part of the project")
+def test_the_building_of_the_paper_comes_out_of_its_raw_log() -> None:
+    imported = import_log(read_log(REAL / "aces-corrected.log.gz"))
+    columns, rows = {"W": -20.0, "C": -1.0, "E": 22.5}, {"N": -0.5, "M": -19.0, "S": -39.0}
+    first = {step.extra["visit"]: step.truth["pose"] for step in reversed(imported.trace.steps)}
+    at = [
+        min(rows, key=lambda r: abs(rows[r] - y)) + min(columns, key=lambda c: abs(columns[c] - x))
+        for x, y, _ in map(first.get, sorted(first))
+    ]
+    assert at == ["NC", "NE", "ME", "SE", "SC", "SW", "MW", "NW", "NC", "MC", "SC", "MC", "MW", "MC", "ME"]
+    done = map_log(read_log(REAL / "aces-corrected.log.gz"), Theory.topological(), rung_limit=None)
+    assert (done.solution.count, done.solution.cost.places, done.solution.cost.paths) == (1, 9, 6)
