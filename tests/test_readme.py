@@ -132,7 +132,7 @@ def shell(lines: str, given: str = "") -> int:
 
 
 def without_seconds(text: str) -> str:
-    return re.sub(r"\d+\.\d\d s", "_ s", text)
+    return re.sub(r"\d+\.\d+ s\b", "_ s", text)
 
 
 def compare(block: Block) -> None:
