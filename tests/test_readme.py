@@ -42,6 +42,8 @@ FILES = [
     for path in (ROOT / folder).rglob("*.*")
 ]
 EXAMPLES = {
+    "trace.jsonl",
+    "maps.json",
     "own.lp",
     "run.jsonl",
     "run.truth.json",
