@@ -445,13 +445,23 @@ class Axioms:
 
     def _shrunk(self, kept: list[clingo.Symbol], assumed: Sequence[Assumption]) -> list[clingo.Symbol]:
         """Pairs that still leave no map after all that can be dropped were dropped, in their order."""
+        core: set[clingo.Symbol] | None = None  # some that clingo found to clash: while all of them are kept there is no need to ask
+
+        def clash(some: list[clingo.Symbol]) -> bool:
+            nonlocal core
+            if core is None or not core <= set(some):
+                if self.consistent(some, assumed):
+                    return False
+                core = {symbol for symbol, _ in self._of_last_core([(symbol, True) for symbol in some])}
+            return True
+
         for axiom in dict.fromkeys(self._pairs[symbol][0] for symbol in kept):
             fewer = [symbol for symbol in kept if self._pairs[symbol][0] != axiom]
-            if not self.consistent(fewer, assumed):
+            if clash(fewer):
                 kept = fewer
         for symbol in tuple(kept):
             fewer = [other for other in kept if other != symbol]
-            if not self.consistent(fewer, assumed):
+            if clash(fewer):
                 kept = fewer
         return kept
 
