@@ -36,10 +36,11 @@ from ssh_abduction.cli import main
 from ssh_abduction.errors import TraceError
 from ssh_abduction.judge.checker import check
 from ssh_abduction.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning, labels_of
-from ssh_abduction.reproduce.claims import EXPERIMENTS, claims, one_to_one, outcome, rate, summary, true_dstates
+from ssh_abduction.reproduce.claims import EXPERIMENTS, Run, claims, measure, one_to_one, outcome, rate, summary, true_dstates
 from ssh_abduction.runner_up import runner_up, second_map, with_runner_up
 
 VIEWS_ALONE = Theory.topological().replace(star="none")
+FEW_CIRCUITS = replace(EXPERIMENTS["notched-rectangle"], tours=10, k_max=8)
 
 
 @pytest.fixture(scope="module")
@@ -48,12 +49,26 @@ def run() -> Trace:
 
 
 @pytest.fixture(scope="module")
+def learnt(run: Trace) -> BootstrapLearner:
+    """What is learnt from the views of the run alone."""
+    return BootstrapLearner(VIEWS_ALONE).fit(run)
+
+
+@pytest.fixture(scope="module")
+def measured() -> Run:
+    """What `reproduce` measures with seed 500 in the notched rectangle, with few circuits, so that it is quick."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(EXPERIMENTS, "notched-rectangle", FEW_CIRCUITS)
+        return measure("notched-rectangle", 500)
+
+
+@pytest.fixture(scope="module")
 def hall() -> Trace:
     return simulate(World.named("taylor-hall"), tours=3, seed=500)
 
 
-def test_the_notched_rectangle_is_learnt_from_its_images_alone(run: Trace) -> None:
-    learner = BootstrapLearner(VIEWS_ALONE).fit(run)
+def test_the_notched_rectangle_is_learnt_from_its_images_alone(run: Trace, learnt: BootstrapLearner) -> None:
+    learner = learnt
     assert learner.clusterer_.k_ == 4
     assert learner.views_[0] == learner.views_[4]
     assert learner.labels_[0] != learner.labels_[4]
@@ -84,11 +99,11 @@ def test_the_loop_fits_on_one_screen() -> None:
     assert len(inspect.getsource(BootstrapLearner.fit).splitlines()) < 15
 
 
-def test_learning_reads_no_truth(run: Trace) -> None:
+def test_learning_reads_no_truth(run: Trace, learnt: BootstrapLearner) -> None:
     bare = replace(run, steps=tuple(replace(step, truth=None) for step in run.steps))
-    with_truth, without = (BootstrapLearner(VIEWS_ALONE).fit(trace) for trace in (run, bare))
-    np.testing.assert_array_equal(with_truth.labels_, without.labels_)
-    assert with_truth.map_ == without.map_
+    without = BootstrapLearner(VIEWS_ALONE).fit(bare)
+    np.testing.assert_array_equal(learnt.labels_, without.labels_)
+    assert learnt.map_ == without.map_
 
 
 def test_where_maps_disagree_nothing_is_learnt_unless_one_is_chosen() -> None:
@@ -466,11 +481,12 @@ def test_errors_of_the_wings_are_one_line(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_reproduce_writes_the_page_and_all_that_made_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, measured: Run
 ) -> None:
     """With few circuits, so that it is quick; the claims themselves are measured by `reproduce`, over 20 seeds."""
-    small = replace(EXPERIMENTS["notched-rectangle"], tours=10, k_max=8)
-    monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", small)
+    monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", FEW_CIRCUITS)
+    known = {("notched-rectangle", 500): measured}
+    monkeypatch.setattr("ssh_abduction.reproduce.report.measure", lambda *asked: known[asked])
     words = ["reproduce", "notched-rectangle", "--seeds", "500", "--jobs", "1", "--no-outcomes", "-o", str(tmp_path)]
     assert main(words) == 0
     out = capsys.readouterr().out
@@ -496,12 +512,8 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     assert json.loads(capsys.readouterr().out)["claims"] == claimed
 
 
-def test_a_summary_counts_the_seeds_in_which_a_claim_holds() -> None:
-    from ssh_abduction.reproduce.claims import measure
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(EXPERIMENTS, "notched-rectangle", replace(EXPERIMENTS["notched-rectangle"], tours=10, k_max=8))
-        good = measure("notched-rectangle", 500)
+def test_a_summary_counts_the_seeds_in_which_a_claim_holds(measured: Run) -> None:
+    good = measured
     bad = replace(good, seed=1, k=5, uncertainty={**good.uncertainty, 5: 0.9}, cost={"dstates": 9, "places": 4, "paths": 4}, right=False)
     table = {row["claim"]: row for row in summary("notched-rectangle", [good, bad])}
     assert table["U at that k"]["holds"] == 1
