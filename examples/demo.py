@@ -1,4 +1,4 @@
-"""Solve the route that a robot drove through the ACES building, print its minimal maps and what tells them apart, draw one."""
+"""Solve the route that a robot drove through the ACES building, print its minimal maps and what tells them apart, draw one. Then map a house from a robot's log."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from ssh_abduction import Theory, Trace, compare, solve
+from ssh_abduction.cli import main as main_of_the_shell
 from ssh_abduction.cli.text import compared, describe
 from ssh_abduction.judge.checker import check
 from ssh_abduction.picture import svg
@@ -29,6 +30,11 @@ def main() -> None:
     picture = folder / "aces3-map.svg"
     picture.write_text(svg(solution.maps[0]) + "\n", encoding="utf-8")
     print(f"\nmap 1 is drawn in {picture}")
+    print("\na simulated robot drives through a house with doors, and its log is mapped")
+    log = folder / "house.log"
+    main_of_the_shell(["simulate", "doors", "--as", "carmen", "-o", str(log)])
+    main_of_the_shell(["map", str(log), "-o", str(folder / "house"), "--again"])
+    print(f"look at {folder / 'house' / 'report.html'}")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ from perception.places.track import follow
 from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
 from ssh_abduction import Theory
-from ssh_abduction.cli import main
+from ssh_abduction.cli import batch, main, workers
+from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.log_maps import map_log
 from ssh_abduction.odometry import between
@@ -122,6 +124,30 @@ def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(hall: Path, runs
     assert f"{hall}: done already, in {runs / 'hall'}" in told.out
     assert f"{bad}: expected a robot's log" in told.out
     assert "errors in 1 of 1 logs" in told.err
+
+
+def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, other = runs / "hall", tmp_path / "other"
+    shutil.copytree(folder, other)
+    assert main(["compare", str(folder), str(other)]) == 0
+    assert "the two runs have the same settings" in capsys.readouterr().out
+    run = json.loads((other / "run.json").read_text())
+    run["scale"]["radius"] = 9.0
+    (other / "run.json").write_text(json.dumps(run))
+    (other / "trace.jsonl").write_text("")
+    assert main(["compare", str(folder), str(other)]) == 0
+    assert "scale.radius: " in capsys.readouterr().out
+
+
+def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_alone(hall: Path, tmp_path: Path) -> None:
+    question = MapQuestion(None, (None, None, None), None, None, 40.0, 1, False)
+    small = tmp_path / "small.log"
+    small.write_text("\n".join(hall.read_text().splitlines()[:260]) + "\n")
+    (answer,) = batch.here(question, [str(small)], 2, batch.Stop(tmp_path / "stop"))
+    assert answer.code in (0, 10)
+    assert dict(answer.files)["run.json"]
+    lost = question.lost(workers.Lost(0, late=False), str(small))
+    assert (lost.code, "got killed" in lost.line) == (1, True)
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="real logs are not part of the project")

@@ -44,6 +44,7 @@ FILES = [
 EXAMPLES = {
     "trace.jsonl",
     "maps.json",
+    "run.json",
     "own.lp",
     "run.jsonl",
     "run.truth.json",

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs
 from ssh_abduction.cli.text import compared, counted, depending
-from ssh_abduction.errors import printable
+from ssh_abduction.errors import brief, named, printable
 from ssh_abduction.files import json_line
+from ssh_abduction.maps import read_json
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.compare import Comparison
+
+# Figures of a run that differ from one time to the next though nothing else does.
+UNSTEADY = ("seconds", "ladder", "drove", "log.source")
 
 
 def add_parser(verbs: Verbs) -> None:
     text = "Compare the minimal maps of a trace: what do all of them share, where do they differ, and which steps decide between them?"
     parser = verbs.add_parser("compare", help="what do rival maps share, and where do they differ?", description=text)
-    parser.add_argument("maps", help="what solve --json printed, or one saved map; - for standard input")
+    parser.add_argument("maps", help="what solve --json printed, one saved map, or the folder of a run of map; - for standard input")
     parser.add_argument(
         "other", nargs="?", help="maps of the same trace to compare with: which maps are in both, and how do the first ones differ?"
     )
@@ -36,8 +41,13 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.rivals.difference import difference
     from ssh_abduction.rivals.listing import Listing
 
-    listing = Listing.load(options.maps)
-    other = Listing.load(options.other) if options.other is not None else None
+    maps, others = within(options.maps), within(options.other) if options.other is not None else None
+    if maps != options.maps and others != options.other:
+        print("\n".join(differences(options.maps, options.other)))
+        if not of_one_trace(options.maps, options.other):
+            return 0  # maps of different traces cannot be compared any further
+    listing = Listing.load(maps)
+    other = Listing.load(others) if others is not None else None
     if options.diff:
         there = other or listing
         listing.check_same_trace(there)
@@ -49,6 +59,32 @@ def run(options: argparse.Namespace) -> int:
     found = compare(listing, other)
     print(json_line(found.to_dict()) if options.json else "\n".join(_lines(found)))
     return 0
+
+
+def within(name: str) -> str:
+    """The maps of a run, where its folder is named."""
+    return str(Path(name) / "maps.json") if (Path(name) / "run.json").is_file() else name
+
+
+def differences(first: str, other: str) -> Iterator[str]:
+    """What two runs of `map` differ in, a line for each setting and each figure."""
+    here, there = (_flat(read_json(Path(folder) / "run.json")) for folder in (first, other))
+    differing = [name for name in {**here, **there} if here.get(name) != there.get(name) and not name.startswith(UNSTEADY)]
+    yield from (f"{name}: {brief(here.get(name))} in {named(first)}, {brief(there.get(name))} in {named(other)}" for name in differing)
+    if not differing:
+        yield "the two runs have the same settings, and found the same"
+
+
+def of_one_trace(first: str, other: str) -> bool:
+    """Whether two runs have the same steps."""
+    return (Path(first) / "trace.jsonl").read_bytes() == (Path(other) / "trace.jsonl").read_bytes()
+
+
+def _flat(value: Any, name: str = "") -> dict[str, Any]:
+    """The values of nested objects, by the names that lead to them."""
+    if not isinstance(value, dict):
+        return {name: value}
+    return {key: v for part in value for key, v in _flat(value[part], f"{name}.{part}".lstrip(".")).items()}
 
 
 def _lines(found: Comparison) -> Iterator[str]:
