@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import tempfile
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -15,7 +16,7 @@ import numpy as np
 import planar
 from streets import Leg, _back, _moves, _way, drawn
 
-from simulator.errors import SimulatorError
+from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Trace
@@ -61,7 +62,9 @@ class Scene:
                 here = ways[route[-1]]
             world = self.at(first, tuple(route))
             try:
-                return simulate(change(world, rng) if change else world, 1, int(rng.integers(2**31)))
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", SimulatorWarning)  # A drive at random ends anywhere.
+                    return simulate(change(world, rng) if change else world, 1, int(rng.integers(2**31)))
             except SimulatorError as error:
                 failure = error
         raise failure

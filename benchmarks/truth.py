@@ -34,7 +34,18 @@ from ssh_abduction.odometry import NUMBERS
 
 ROOT = Path(__file__).parent.parent
 # What the noise is unless a flag says otherwise: 5 % along the way, 0.5 % across it, and 0.002 rad of heading in a metre.
-NOISE = {"along": 0.05, "across": 0.005, "heading": 0.002, "turning": 0.0, "position": 0.0, "angle": 0.0, "scale": 0.0, "bend": 0.0}
+NOISE = {
+    "along": 0.05,
+    "across": 0.005,
+    "heading": 0.002,
+    "turning": 0.0,
+    "position": 0.0,
+    "angle": 0.0,
+    "scale": 0.0,
+    "bend": 0.0,
+    "offset": 0.0,
+    "facing": 0.0,
+}
 # The layout of the ACES3 route: three columns and three rows of places, by their x and y in metres.
 COLUMNS, ROWS = (-20.0, -1.0, 22.5), (-0.5, -19.0, -39.0)
 ACES3 = {name: (COLUMNS[i % 3], ROWS[i // 3]) for i, name in enumerate(("NW", "N", "NE", "W", "C", "E", "SW", "S", "SE"))}

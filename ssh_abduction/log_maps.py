@@ -142,6 +142,6 @@ def map_log(
     solution = solve(imported.trace, chosen, limit=limit, maps=maps)
     seconds["maps"] = round(time.process_time() - begin, 3)
     begin = time.process_time()
-    rungs = () if rung_limit is None else tuple(ladder(imported.trace, chosen, limit=rung_limit, maps=1))
+    rungs = () if rung_limit is None else tuple(ladder(imported.trace, chosen, limit=rung_limit, maps=1, stars=chosen.star != "none"))
     seconds["ladder"] = round(time.process_time() - begin, 3)
     return LogMap(log, imported, solution, rungs, seconds)

@@ -57,13 +57,12 @@ class Rung:
         }
 
 
-def rungs(trace: Trace, theory: Theory) -> Iterator[tuple[str, Theory]]:
+def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[str, Theory]]:
     """The theories of the ladder, each with one kind of evidence more, as far as the trace has it."""
-    uses_stars = theory.star != "none"
     jumped, theory = theory.jumped, theory.replace(star="none", displacement="none", planar=False, jumped=0)
     yield "views", theory
     topological = theory.level == "topological"
-    if trace.has_stars and uses_stars:
+    if trace.has_stars and stars:
         theory = theory.replace(star="auto" if topological else "alike")
         yield "+ star", theory
     if trace.has_displacements:
@@ -75,15 +74,18 @@ def rungs(trace: Trace, theory: Theory) -> Iterator[tuple[str, Theory]]:
         yield "+ planarity", theory.replace(planar=True)
 
 
-def ladder(trace: Trace, theory: Theory | None = None, *, limit: float | None = None, maps: int = 100) -> Iterator[Rung]:
+def ladder(
+    trace: Trace, theory: Theory | None = None, *, limit: float | None = None, maps: int = 100, stars: bool = True
+) -> Iterator[Rung]:
     """The rungs of a trace, as they are solved.
 
     theory  the other choices; Theory.topological() by default. What it says of stars, displacements and planarity is laid over
     limit   seconds for each rung
     maps    so many minimal maps, at most, are listed and evaluated on each rung
+    stars   whether stars have a rung, where the trace has some
     """
     checked_trace(trace)
     has_truth = tells_names(trace)
-    for name, chosen in rungs(trace, checked_theory(theory)):
+    for name, chosen in rungs(trace, checked_theory(theory), stars):
         solution = solve(trace, chosen, limit=limit, maps=maps)
         yield Rung(name, solution, evaluate(solution.maps, trace) if has_truth and solution.maps else None)

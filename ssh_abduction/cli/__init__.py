@@ -31,6 +31,7 @@ from ssh_abduction.cli import (
     import_log,
     ladder,
     localize,
+    map_logs,
     next_experiment,
     route,
     show,
@@ -40,7 +41,6 @@ from ssh_abduction.cli import (
     train,
     view,
 )
-from ssh_abduction.cli import map as map_logs
 from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.verbosity import add_verbosity, telling
 from ssh_abduction.errors import SSHError, named, printable
