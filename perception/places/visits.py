@@ -150,7 +150,7 @@ def _stay(track: Track, middle: Array, scan: int, radius: float) -> tuple[int, i
 
 
 def _one_for_each_pass(found: list[Visit], scale: Scale) -> list[Visit]:
-    """Of visits in a row to middles that are too near to be two places the best supported one stays. So does one visit of several to one place without another between."""
+    """The visits, where those in a row whose middles are too near to be two places are one: the best supported of them, for as long as all together."""
     kept: list[Visit] = []
     for visit in found:
         if kept and math.dist(kept[-1].middle, visit.middle) < PASSING * scale.radius:

@@ -90,6 +90,11 @@ class Stop:
         return self.file.exists()
 
 
+def in_a_line(error: Exception) -> str:
+    """What went wrong, in one line."""
+    return printable(" ".join((str(error) if isinstance(error, SSHError) else f"{type(error).__name__}: {error}").split()))
+
+
 class Asked(Protocol):
     """What is asked about each of many files. Plain data, as it travels to other processes and machines; so are its answers, which have the number of their file."""
 
@@ -213,7 +218,7 @@ class Question:
 
     def failed(self, number: int, path: str, error: Exception) -> Answer:
         """The answer for a trace that was not solved."""
-        message = printable(" ".join((str(error) if isinstance(error, SSHError) else f"{type(error).__name__}: {error}").split()))
+        message = in_a_line(error)
         line = dump({"trace": path, "status": "error", "error": message}) if self.json else f"{named(path)}: error: {message}"
         return Answer(number, line, EXIT_ERROR)
 

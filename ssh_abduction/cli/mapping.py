@@ -22,7 +22,7 @@ from ssh_abduction.cli.import_log import damage, named_after
 from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.outcome import exit_code, interrupted_code, warn
 from ssh_abduction.cli.text import counted
-from ssh_abduction.errors import SolverError, SSHError, named, printable
+from ssh_abduction.errors import SolverError, SSHError, named
 from ssh_abduction.files import write_file
 from ssh_abduction.theory.theory import Theory
 
@@ -131,7 +131,7 @@ class MapQuestion:
         return self.failed(lost.number, path, SolverError(batch.KILLED))
 
     def failed(self, number: int, path: str, error: Exception) -> MapAnswer:
-        message = printable(" ".join((str(error) if isinstance(error, SSHError) else f"{type(error).__name__}: {error}").split()))
+        message = batch.in_a_line(error)
         return MapAnswer(number, message if message.startswith(named(path)) else f"{named(path)}: error: {message}", EXIT_ERROR)
 
 
