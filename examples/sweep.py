@@ -20,12 +20,12 @@ from pathlib import Path
 
 from ssh_abduction.cli import main as shell
 
-# What each theory is asked with, beside the default.
+# What each theory is asked with. Where none is named, it is the one that suits the walls of the building, with what is said laid over it.
 THEORIES = {
     "as it suits": [],
-    "stars": ["--star", "auto", "--boundary", "strict"],
-    "no stars": ["--star", "none"],
-    "no sides": ["--boundary", "none"],
+    "stars and sides": ["--theory", "topological"],
+    "no stars": ["--theory", "topological", "--star", "none"],
+    "no sides": ["--theory", "topological", "--boundary", "none"],
     "no stars, no sides": ["--star", "none", "--boundary", "none"],
     "planar": ["--planar"],
     "next place": ["--next-place"],
@@ -48,9 +48,8 @@ def main() -> None:
     rows = []
     for theory in options.theories:
         runs = options.folder / theory.replace(", ", "-").replace(" ", "-")
-        # A log that stands alone would be written into the folder itself.
-        for batch in [logs] if len(logs) > 1 else [[*logs, *logs]]:
-            shell(["map", *map(str, batch), "-o", str(runs), "--time-limit", options.time_limit, *where, *THEORIES[theory], "-q"])
+        folder = runs if len(logs) > 1 else runs / logs[0].stem  # a log that stands alone has the folder that is named
+        shell(["map", *map(str, logs), "-o", str(folder), "--time-limit", options.time_limit, *where, *THEORIES[theory], "-q"])
         rows += [row for log in logs for row in rows_of(theory, runs / log.stem)]
     text = "".join(json.dumps(row) + "\n" for row in rows)
     (options.folder / "rows.jsonl").write_text(text, encoding="utf-8")

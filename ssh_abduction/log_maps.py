@@ -104,10 +104,8 @@ class LogMap:
         return {name: text.encode() for name, text in found.items()}
 
 
-def theory_for(imported: Imported, theory: Theory | None = None) -> Theory:
-    """The theory that suits a log: the one that is given, or else the one that suits its walls."""
-    if theory is not None:
-        return theory
+def theory_for(imported: Imported) -> Theory:
+    """The theory that suits the walls of a building."""
     if imported.trace.extra["right_angles"]:
         return Theory.topological()
     return Theory.topological().replace(star="none", boundary="none")
@@ -117,6 +115,7 @@ def map_log(
     log: RobotLog,
     theory: Theory | None = None,
     *,
+    choices: Mapping[str, Any] | None = None,
     gateway: float | None = None,
     radius: float | None = None,
     name: str | None = None,
@@ -127,6 +126,7 @@ def map_log(
     """The minimal maps of a building, from a robot's log.
 
     theory           the axioms; `theory_for` chooses, where it is None
+    choices          fields of Theory, laid over that: a choice about one thing leaves the others as they suit the log
     gateway, radius  metres, as in perception.places.scale.Scale; what the log suggests, where they are None
     limit            seconds for the minimal maps
     maps             so many of them are listed at most
@@ -137,11 +137,13 @@ def map_log(
     imported = import_log(log, gateway, radius, name)
     seconds = dict(imported.seconds)
     _log.info("%d visits, %d steps", len(imported.visits), len(imported.trace))
-    chosen = theory_for(imported, theory)
+    chosen = (theory or theory_for(imported)).replace(**choices or {})
     begin = time.process_time()
     solution = solve(imported.trace, chosen, limit=limit, maps=maps)
     seconds["maps"] = round(time.process_time() - begin, 3)
     begin = time.process_time()
-    rungs = () if rung_limit is None else tuple(ladder(imported.trace, chosen, limit=rung_limit, maps=1, stars=chosen.star != "none"))
+    rungs: tuple[Rung, ...] = ()
+    if rung_limit is not None:
+        rungs = tuple(ladder(imported.trace, chosen, limit=rung_limit, maps=1, stars=chosen.star != "none", known=solution))
     seconds["ladder"] = round(time.process_time() - begin, 3)
     return LogMap(log, imported, solution, rungs, seconds)

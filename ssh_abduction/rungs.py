@@ -70,12 +70,18 @@ def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[st
         yield "+ pairs", theory
         theory = theory.replace(joint=2)
         yield "+ geometry", theory
-    if topological:
+    if topological and not theory.has_faults:  # a theory has the one or the other
         yield "+ planarity", theory.replace(planar=True)
 
 
 def ladder(
-    trace: Trace, theory: Theory | None = None, *, limit: float | None = None, maps: int = 100, stars: bool = True
+    trace: Trace,
+    theory: Theory | None = None,
+    *,
+    limit: float | None = None,
+    maps: int = 100,
+    stars: bool = True,
+    known: Solution | None = None,
 ) -> Iterator[Rung]:
     """The rungs of a trace, as they are solved.
 
@@ -83,9 +89,10 @@ def ladder(
     limit   seconds for each rung
     maps    so many minimal maps, at most, are listed and evaluated on each rung
     stars   whether stars have a rung, where the trace has some
+    known   a solution of this trace that is there already: the rung that has its theory takes it, and is not solved again
     """
     checked_trace(trace)
     has_truth = tells_names(trace)
     for name, chosen in rungs(trace, checked_theory(theory), stars):
-        solution = solve(trace, chosen, limit=limit, maps=maps)
+        solution = known if known and known.theory == chosen.resolve(trace) else solve(trace, chosen, limit=limit, maps=maps)
         yield Rung(name, solution, evaluate(solution.maps, trace) if has_truth and solution.maps else None)

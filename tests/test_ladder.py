@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import truth
 
-from ssh_abduction import Odometry, Theory
+from ssh_abduction import Odometry, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.rungs import ladder
 
@@ -32,6 +32,18 @@ def test_what_a_trace_does_not_have_is_no_rung() -> None:
     assert [rung.name for rung in ladder(trace.without_displacements(), maps=1)] == ["views", "+ star", "+ planarity"]
     causal = {rung.name: rung.solution.theory.star for rung in ladder(trace, Theory.causal(), maps=1)}
     assert causal == {"views": "none", "+ star": "alike", "+ pairs": "alike", "+ geometry": "alike"}  # planarity is about places
+
+
+def test_what_is_solved_already_is_its_rung() -> None:
+    square = [(10, 0, 0), (0, 0, -1.5708)] * 4
+    trace = Trace.from_steps("ab" * 4 + "a", ["travel", "right"] * 4, displacements=square)
+    known = solve(trace)
+    assert [rung.name for rung in ladder(trace, known=known) if rung.solution is known] == ["+ geometry"]
+
+
+def test_where_faults_are_allowed_planarity_is_no_rung() -> None:
+    trace = Trace.from_steps("aba", ["travel", "travel"])
+    assert [rung.name for rung in ladder(trace, Theory.topological().replace(misread=1.5))] == ["views"]
 
 
 def test_the_shell_prints_a_row_a_rung(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from perception.places.local_map import CELL, distances
 from perception.places.track import follow
 from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
-from ssh_abduction import Theory
+from ssh_abduction import SSHError, Theory, log_maps
 from ssh_abduction.cli import batch, main, workers
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.evaluation import evaluate_visits
@@ -126,6 +128,34 @@ def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(hall: Path, runs
     assert "errors in 1 of 1 logs" in told.err
 
 
+@pytest.mark.parametrize(
+    ("flags", "star", "boundary"),
+    [
+        ([], "none", "none"),
+        (["--theory", "topological"], "auto", "strict"),
+        (["--star", "auto", "--boundary", "strict"], "auto", "strict"),
+        (["--star", "auto"], "auto", "none"),
+        (["--misread", "1.5"], "none", "none"),
+        (["--theory", "topological", "--star", "none"], "none", "strict"),
+        (["--level", "causal"], "none", "none"),
+    ],
+)
+def test_flags_are_laid_over_the_theory_that_suits_the_walls(
+    hall: Path, flags: list[str], star: str, boundary: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trace = replace(Trace.from_steps("ab", ["travel"]), extra={"right_angles": False})
+
+    def solve(_: Trace, theory: Theory, **__: object) -> None:
+        raise SSHError(f"star={theory.star}, boundary={theory.boundary}")
+
+    monkeypatch.setattr(log_maps, "import_log", lambda *_: SimpleNamespace(trace=trace, visits=(), seconds={}))
+    monkeypatch.setattr(log_maps, "solve", solve)
+    small = hall.with_name("first.log")
+    small.write_text("\n".join(hall.read_text().splitlines()[:20]) + "\n")
+    assert main(["map", str(small), "-o", str(hall.with_name("never")), *flags]) == 1
+    assert f"star={star}, boundary={boundary}" in capsys.readouterr().err
+
+
 def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, other = runs / "hall", tmp_path / "other"
     shutil.copytree(folder, other)
@@ -140,7 +170,7 @@ def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.Captur
 
 
 def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_alone(hall: Path, tmp_path: Path) -> None:
-    question = MapQuestion(None, (None, None, None), None, None, 40.0, 1, False)
+    question = MapQuestion(None, {}, (None, None, None), None, None, 40.0, 1, False)
     small = tmp_path / "small.log"
     small.write_text("\n".join(hall.read_text().splitlines()[:260]) + "\n")
     (answer,) = batch.here(question, [str(small)], 2, batch.Stop(tmp_path / "stop"))

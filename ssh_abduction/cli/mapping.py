@@ -19,7 +19,7 @@ from typing import Any
 
 from ssh_abduction.cli import EXIT_ERROR, batch, workers
 from ssh_abduction.cli.import_log import damage, named_after
-from ssh_abduction.cli.options import theory_of
+from ssh_abduction.cli.options import choices_of, theory_of
 from ssh_abduction.cli.outcome import exit_code, interrupted_code, warn
 from ssh_abduction.cli.text import counted
 from ssh_abduction.errors import SolverError, SSHError, named
@@ -46,6 +46,7 @@ class MapQuestion:
     """What is asked about each log. Plain data, as it travels to other processes and machines; an answer brings its files along."""
 
     theory: Theory | None
+    choices: dict[str, Any]
     reading: tuple[str | None, str | None, str | None]
     gateway: float | None
     radius: float | None
@@ -57,8 +58,10 @@ class MapQuestion:
     def settings(self) -> dict[str, Any]:
         """What a run depends on besides its log."""
         theory = self.theory.to_dict() if self.theory else None
+        laid_over = (self.theory or Theory.topological()).replace(**self.choices).to_dict()
         return {
             "theory": theory,
+            "choices": {name: laid_over[name] for name in self.choices},
             "reading": list(self.reading),
             "gateway": self.gateway,
             "radius": self.radius,
@@ -77,16 +80,20 @@ class MapQuestion:
         try:
             if given_up():
                 raise SSHError("expected time to map this log, got none, as all was stopped; map it again")
-            if content is None or Path(path).exists():
-                return self._mapped(number, path, path)
+            if content is None:
+                return self._mapped(number, path, path, digest(path))
+            sent = hashlib.sha256(content).hexdigest()
+            if Path(path).exists() and digest(path) == sent:
+                return self._mapped(number, path, path, sent)
             with tempfile.TemporaryDirectory() as folder:
                 here = Path(folder) / Path(path).name[-KEPT:]
                 here.write_bytes(content)
-                return self._mapped(number, path, str(here))
+                return self._mapped(number, path, str(here), sent)
         except Exception as error:  # of any kind: the other logs must not suffer
             return self.failed(number, path, error)
 
-    def _mapped(self, number: int, path: str, here: str) -> MapAnswer:
+    def _mapped(self, number: int, path: str, here: str, content: str | None) -> MapAnswer:
+        """Map the log that is here, and whose content has this digest, which is made first: if the log changes meanwhile, it is mapped again some day."""
         from perception.readers.logs import read_log
         from ssh_abduction.log_maps import RUNG, map_log
 
@@ -95,6 +102,7 @@ class MapQuestion:
         done = map_log(
             log,
             self.theory,
+            choices=self.choices,
             gateway=self.gateway,
             radius=self.radius,
             name=named_after(path),
@@ -104,7 +112,7 @@ class MapQuestion:
         )
         files = done.files()
         run = json.loads(files["run.json"])
-        run["log"]["source"], run["settings"], run["digest"] = path, self.settings, digest(here)
+        run["log"]["source"], run["settings"], run["digest"] = path, self.settings, content
         files["run.json"] = (json.dumps(run, indent=2, ensure_ascii=False) + "\n").encode()
         cost, solution = done.solution.cost, done.solution
         found = (
@@ -141,7 +149,7 @@ def run(options: argparse.Namespace) -> int:
     if "-" in options.logs:
         raise SSHError("-: expected the files of logs, got standard input; save it to a file")
     question = MapQuestion(
-        _theory(options),
+        *_theory(options),
         (options.format, options.scan_topic, options.odom_topic),
         options.gateway,
         options.radius,
@@ -201,29 +209,35 @@ def _folders(logs: list[str], folder: Path) -> dict[str, Path]:
     return folders
 
 
-def _theory(options: argparse.Namespace) -> Theory | None:
-    """The theory that the flags ask for; None where none does, as it then depends on the log."""
-    chosen = theory_of(options)
-    return None if chosen == Theory.topological() else chosen
+def _theory(options: argparse.Namespace) -> tuple[Theory | None, dict[str, Any]]:
+    """The theory that is named, and what is laid over it. Where none is named, it is None, as it then depends on the log. Raises TheoryError."""
+    asked = theory_of(options)
+    choices = {name: getattr(asked, name) for name in choices_of(options)}
+    return (asked, {}) if options.theory or asked.level == "causal" else (None, choices)
 
 
 def is_done(folder: Path, path: str, question: MapQuestion) -> bool:
     """Whether a folder holds the run of this log with these settings."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         run = json.loads((folder / "run.json").read_text())
-        return bool(run["settings"] == json.loads(json.dumps(question.settings)) and run["digest"] == digest(path))
+        settings = json.loads(json.dumps(question.settings))
+        return bool(run["settings"] == settings and run["digest"] is not None and run["digest"] == digest(path))
     return False
 
 
-def digest(path: str) -> str:
-    """A digest of a log: of its content, or, of a folder, of the names and sizes of its files."""
+def digest(path: str) -> str | None:
+    """A digest of a log: of its content, or, of a folder, of the names and sizes of its files. None of a pipe, which can be read only once. Raises LogError."""
+    from perception.readers.lines import opened
+
     whole = hashlib.sha256()
     file = Path(path)
     if file.is_dir():
         for part in sorted(file.rglob("*")):
             whole.update(f"{part.relative_to(file)} {part.stat().st_size}\n".encode())
-    else:
-        with file.open("rb") as content:
+    elif file.is_file() or not file.exists():
+        with opened(path) as content:
             for block in iter(partial(content.read, 2**20), b""):
                 whole.update(block)
+    else:
+        return None
     return whole.hexdigest()

@@ -112,13 +112,19 @@ def _is_trace(file: str) -> bool:
 
 def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theory:
     """The theory that the options ask for: over the preset, or over the one found where no preset is named. Raises TheoryError."""
-    chosen = {f.name: getattr(options, f.name) for f in fields(Theory) if getattr(options, f.name, None) is not None}
-    if "prefer" in chosen and not chosen["prefer"]:
-        chosen["prefer"] = ()
+    chosen = choices_of(options)
     if options.theory is None and found is not None:
         return found.replace(**chosen)
     preset = "causal" if chosen.get("level") == "causal" else "topological"
     return PRESETS[options.theory or preset]().replace(**chosen)
+
+
+def choices_of(options: argparse.Namespace) -> dict[str, Any]:
+    """What the options say of single fields of a theory, by name, as it was given."""
+    chosen = {f.name: getattr(options, f.name) for f in fields(Theory) if getattr(options, f.name, None) is not None}
+    if "prefer" in chosen and not chosen["prefer"]:
+        chosen["prefer"] = ()
+    return chosen
 
 
 def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
