@@ -22,15 +22,21 @@ from ssh_abduction.files import json_line
 from ssh_abduction.log_report import report
 from ssh_abduction.logs import log_of
 from ssh_abduction.rivals.page.html import view_page
-from ssh_abduction.rungs import Rung, ladder
+from ssh_abduction.rungs import Rung, ladder, rungs
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
 
-# Seconds for all minimal maps, and for each rung of the ladder.
-LIMIT, RUNG = 60.0, 10.0
+# A log is mapped in this share of the time that the robot drove, unless a limit is given: what the import took is taken off it, and the ladder has a quarter of the rest.
+SHARE, LADDER = 1 / 20, 1 / 4
+# The minimal maps, and each rung of the ladder, have so many seconds at least, however short the drive was.
+LEAST, LEAST_RUNG = 5.0, 1.0
+# A rung has so many seconds at most: the ladder is for the reader, and nothing depends on its proofs.
+RUNG = 10.0
+# Metres a second that the robot is taken to have driven where the log has no clock. Robots whose logs have one drove 0.2 to 0.4 on the average.
+SPEED = 0.5
 # So many minimal maps are listed, and ranked by how well they close.
 MAPS = 300
 # Times between scans that are longer than so many times the usual one are gaps of the log, or clocks that jumped: they do not count as driving.
@@ -46,6 +52,7 @@ class LogMap:
     solution  its minimal maps, in the order of how well they close
     rungs     what each kind of evidence is worth; empty where that was not asked
     seconds   processor time of each stage, from the track on
+    limit     seconds that there were for the minimal maps
     """
 
     log: RobotLog
@@ -53,16 +60,12 @@ class LogMap:
     solution: Solution
     rungs: tuple[Rung, ...]
     seconds: Mapping[str, float]
+    limit: float
 
     @property
     def drove(self) -> float | None:
         """Seconds that the robot drove, by the clock of the log; None where its times are cut, wrapped or missing."""
-        times = [scan.time for scan in self.log.scans if scan.time is not None]
-        steps = [later - earlier for earlier, later in itertools.pairwise(times)]
-        if not steps or any(step < 0 for step in steps) or sum(step > 0 for step in steps) < len(steps) / 2:
-            return None
-        usual = median(step for step in steps if step > 0)
-        return math.fsum(step for step in steps if step < GAP * usual) or None
+        return seconds_driven(self.log)
 
     def to_dict(self) -> dict[str, Any]:
         """What run.json holds: settings, counts, and the time of each stage."""
@@ -90,6 +93,7 @@ class LogMap:
             "cost": solution.cost.to_dict() if solution.cost else None,
             "ladder": [rung.to_dict() for rung in self.rungs],
             "seconds": dict(self.seconds),
+            "limit": round(self.limit, 1),
             "drove": self.drove,
         }
 
@@ -111,6 +115,22 @@ def theory_for(imported: Imported) -> Theory:
     return Theory.topological().replace(star="none", boundary="none")
 
 
+def seconds_driven(log: RobotLog) -> float | None:
+    """Seconds that the robot drove, by the clock of a log; None where its times are cut, wrapped or missing."""
+    times = [scan.time for scan in log.scans if scan.time is not None]
+    steps = [later - earlier for earlier, later in itertools.pairwise(times)]
+    if not steps or any(step < 0 for step in steps) or sum(step > 0 for step in steps) < len(steps) / 2:
+        return None
+    usual = median(step for step in steps if step > 0)
+    return math.fsum(step for step in steps if step < GAP * usual) or None
+
+
+def seconds_left(log: RobotLog, imported: Imported) -> float:
+    """What the import left of the time in which a log is to be mapped: the twentieth part of what the robot drove. Below 0 where it left none."""
+    drove = seconds_driven(log) or float(imported.track.way[-1]) / SPEED
+    return SHARE * drove - math.fsum(imported.seconds.values())
+
+
 def map_log(
     log: RobotLog,
     theory: Theory | None = None,
@@ -119,18 +139,18 @@ def map_log(
     gateway: float | None = None,
     radius: float | None = None,
     name: str | None = None,
-    limit: float | None = LIMIT,
+    limit: float | None = None,
     maps: int = MAPS,
-    rung_limit: float | None = RUNG,
+    with_ladder: bool = True,
 ) -> LogMap:
     """The minimal maps of a building, from a robot's log.
 
     theory           the axioms; `theory_for` chooses, where it is None
     choices          fields of Theory, laid over that: a choice about one thing leaves the others as they suit the log
     gateway, radius  metres, as in perception.places.scale.Scale; what the log suggests, where they are None
-    limit            seconds for the minimal maps
+    limit            seconds for the minimal maps; None for what is left of a twentieth of the time that the robot drove, and LEAST at least
     maps             so many of them are listed at most
-    rung_limit       seconds for each rung of the ladder; None leaves the ladder out
+    with_ladder      whether it is found out, too, what each kind of evidence is worth
 
     Raises LogError, and TheoryError for a theory that does not suit the trace.
     """
@@ -138,12 +158,15 @@ def map_log(
     seconds = dict(imported.seconds)
     _log.info("%d visits, %d steps", len(imported.visits), len(imported.trace))
     chosen = (theory or theory_for(imported)).replace(**choices or {})
+    left = seconds_left(log, imported)
+    allowed = max(left * (1 - LADDER if with_ladder else 1), LEAST) if limit is None else limit
     begin = time.process_time()
-    solution = solve(imported.trace, chosen, limit=limit, maps=maps)
+    solution = solve(imported.trace, chosen, limit=allowed, maps=maps)
     seconds["maps"] = round(time.process_time() - begin, 3)
-    begin = time.process_time()
-    rungs: tuple[Rung, ...] = ()
-    if rung_limit is not None:
-        rungs = tuple(ladder(imported.trace, chosen, limit=rung_limit, maps=1, stars=chosen.star != "none", known=solution))
-    seconds["ladder"] = round(time.process_time() - begin, 3)
-    return LogMap(log, imported, solution, rungs, seconds)
+    climbed: tuple[Rung, ...] = ()
+    if with_ladder:
+        begin, stars = time.process_time(), chosen.star != "none"
+        share = (left - seconds["maps"]) / len(list(rungs(imported.trace, chosen, stars)))
+        climbed = tuple(ladder(imported.trace, chosen, limit=min(max(share, LEAST_RUNG), RUNG), maps=1, stars=stars, known=solution))
+        seconds["ladder"] = round(time.process_time() - begin, 3)
+    return LogMap(log, imported, solution, climbed, seconds, allowed)

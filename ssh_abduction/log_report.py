@@ -181,12 +181,12 @@ def _settings(run: Mapping[str, Any]) -> str:
 def _time(run: Mapping[str, Any]) -> str:
     total = math.fsum(run["seconds"].values())
     rows = [(stage, f"{seconds:.2f} s", f"{100 * seconds / max(total, 1e-9):.0f} %") for stage, seconds in run["seconds"].items()]
-    told = ""
+    told = f"All stages together took {total:.1f} s of processor time"
     if run["drove"]:
-        told = _paragraph(
-            f"The robot drove {run['drove']:.0f} s. All stages together took {total:.1f} s of processor time, a share of 1/{run['drove'] / max(total, 1e-9):.0f}."
-        )
-    return _table(("stage", "processor", "share"), rows) + told
+        told = f"The robot drove {run['drove']:.0f} s. {told}, a share of 1/{run['drove'] / max(total, 1e-9):.0f}"
+    return _table(("stage", "processor", "share"), rows) + _paragraph(
+        f"{told}. The search for the minimal maps had {run['limit']:g} s at most."
+    )
 
 
 def _log(log: RobotLog, run: Mapping[str, Any]) -> str:

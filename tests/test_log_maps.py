@@ -13,16 +13,17 @@ import numpy as np
 import pytest
 
 from perception.errors import LogError
-from perception.places.importing import import_log
+from perception.places.importing import Imported, import_log
 from perception.places.local_map import CELL, distances
-from perception.places.track import follow
+from perception.places.scale import Scale
+from perception.places.track import Track, follow
 from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
 from ssh_abduction import SSHError, Theory, log_maps
 from ssh_abduction.cli import batch, main, workers
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.evaluation import evaluate_visits
-from ssh_abduction.log_maps import map_log
+from ssh_abduction.log_maps import SPEED, map_log, seconds_left
 from ssh_abduction.odometry import between
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.trace import Trace
@@ -148,12 +149,24 @@ def test_flags_are_laid_over_the_theory_that_suits_the_walls(
     def solve(_: Trace, theory: Theory, **__: object) -> None:
         raise SSHError(f"star={theory.star}, boundary={theory.boundary}")
 
-    monkeypatch.setattr(log_maps, "import_log", lambda *_: SimpleNamespace(trace=trace, visits=(), seconds={}))
+    monkeypatch.setattr(
+        log_maps, "import_log", lambda *_: SimpleNamespace(trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={})
+    )
     monkeypatch.setattr(log_maps, "solve", solve)
     small = hall.with_name("first.log")
     small.write_text("\n".join(hall.read_text().splitlines()[:20]) + "\n")
     assert main(["map", str(small), "-o", str(hall.with_name("never")), *flags]) == 1
     assert f"star={star}, boundary={boundary}" in capsys.readouterr().err
+
+
+def test_a_log_has_a_twentieth_of_its_drive_to_be_mapped_in_less_what_the_import_took() -> None:
+    laser = Laser(-1.0, 1.0, 3, 30.0)
+    timed = tuple(Scan(np.ones(3), laser, (0.1 * i, 0.0, 0.0), time=2.0 * i) for i in range(51))
+    track = Track(np.array([scan.odometry for scan in timed]), np.zeros((51, 3, 3)))
+    imported = Imported(Trace.from_steps("aa", ["travel"]), track, Scale(1.0, 5.0), (), {"track": 0.5, "places": 1.0})
+    assert seconds_left(RobotLog(timed, source="timed.log"), imported) == pytest.approx(100 / 20 - 1.5)
+    untimed = tuple(replace(scan, time=None) for scan in timed)
+    assert seconds_left(RobotLog(untimed, source="untimed.log"), imported) == pytest.approx(5.0 / SPEED / 20 - 1.5)
 
 
 def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -182,7 +195,7 @@ def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_al
 
 @pytest.mark.skipif(not REAL.exists(), reason="real logs are not part of the project")
 def test_the_building_of_the_paper_comes_out_of_its_raw_log() -> None:
-    done = map_log(read_log(REAL / "aces-corrected.log.gz"), Theory.topological(), rung_limit=None)
+    done = map_log(read_log(REAL / "aces-corrected.log.gz"), Theory.topological(), with_ladder=False)
     columns, rows = {"W": -20.0, "C": -1.0, "E": 22.5}, {"N": -0.5, "M": -19.0, "S": -39.0}
     first = {step.extra["visit"]: step.truth["pose"] for step in reversed(done.imported.trace.steps)}
     at = [

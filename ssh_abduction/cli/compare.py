@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.compare import Comparison
 
 # Figures of a run that differ from one time to the next though nothing else does.
-UNSTEADY = ("seconds", "ladder", "drove", "log.source")
+UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
 
 
 def add_parser(verbs: Verbs) -> None:

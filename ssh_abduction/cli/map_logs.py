@@ -21,7 +21,12 @@ def add_parser(verbs: Verbs) -> None:
         "-o", "--output", type=output, required=True, metavar="FOLDER", help="folder to write; of several logs, the folder of their folders"
     )
     parser.add_argument("-n", "--maps", type=int, default=300, metavar="K", help="list at most K minimal maps, 0 for all (default: 300)")
-    parser.add_argument("--time-limit", type=float, default=60.0, metavar="S", help="seconds for the minimal maps (default: 60)")
+    parser.add_argument(
+        "--time-limit",
+        type=float,
+        metavar="S",
+        help="seconds for the minimal maps (default: what is left of a twentieth of the time that the robot drove, and 5 at least)",
+    )
     parser.add_argument("--no-ladder", action="store_true", help="do not work out what each kind of evidence is worth")
     parser.add_argument("--again", action="store_true", help="do again what is done already")
     many = parser.add_argument_group("many logs")

@@ -95,7 +95,7 @@ class MapQuestion:
     def _mapped(self, number: int, path: str, here: str, content: str | None) -> MapAnswer:
         """Map the log that is here, and whose content has this digest, which is made first: if the log changes meanwhile, it is mapped again some day."""
         from perception.readers.logs import read_log
-        from ssh_abduction.log_maps import RUNG, map_log
+        from ssh_abduction.log_maps import map_log
 
         log_format, scan_topic, odom_topic = self.reading
         log = read_log(here, log_format, scan_topic=scan_topic, odom_topic=odom_topic)
@@ -108,7 +108,7 @@ class MapQuestion:
             name=named_after(path),
             limit=self.limit,
             maps=self.maps,
-            rung_limit=RUNG if self.ladder else None,
+            with_ladder=self.ladder,
         )
         files = done.files()
         run = json.loads(files["run.json"])
