@@ -21,7 +21,7 @@ from ssh_abduction.asp.rules import check_rules
 from ssh_abduction.errors import TheoryError, TraceError, brief, is_whole
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.evidence import Displacement, Equality, evidence_of
+from ssh_abduction.theory.evidence import Displacement, Equality, Planar, evidence_of
 from ssh_abduction.theory.theory import ASSERTIONS, Theory, checked_theory
 from ssh_abduction.trace import Action, Step, Trace, checked_trace
 
@@ -265,7 +265,14 @@ class Axioms:
             self._control.ground(parts[start : start + AT_A_TIME])
         self._control.assign_external(facts.query(last), True)
         self._control.assign_external(facts.run_by_steps(), True)
-        self._pairs = {facts.active(axiom, t): (axiom, t) for axiom in theory.axioms for t in range(len(trace))} if relaxed else {}
+        # Whether a map can be drawn is asked of the whole piece, and only where each dstate is at one place: else nothing can be drawn.
+        pairs = ((axiom, t) for axiom in theory.axioms for t in range(len(trace)) if axiom != Planar.axiom or t == last)
+        self._pairs = {facts.active(axiom, t): (axiom, t) for axiom, t in pairs} if relaxed else {}
+        self._drawn = {facts.active(Planar.axiom, last)} & self._pairs.keys()
+        self._placed = [symbol for symbol, (axiom, _) in self._pairs.items() if axiom == "one_place"]
+        if self._drawn:
+            self._control.add("placed", [], facts.rests_on(Planar.axiom, last, "one_place"))
+            self._control.ground([("placed", [])])
 
     @property
     def instances(self) -> tuple[clingo.Symbol, ...]:
@@ -286,7 +293,7 @@ class Axioms:
             if refused is None:
                 return answer.ssh_map
             axiom, refusal = refused
-            self._forbid(refusal, facts.active(axiom, _last_step(refusal)) if self._pairs else None)
+            self._forbid(refusal, facts.active(axiom, self._judged_at(axiom, refusal)) if self._pairs else None)
         return None
 
     def tell_of(self, steps: Iterable[int]) -> None:
@@ -306,8 +313,9 @@ class Axioms:
         """
         # Clingo's own way (cautious reasoning) loses atoms where it is asked under assumptions.
         found = frozenset(self._conclusions)
+        holding = active if self._drawn.isdisjoint(active) else [*active, *self._placed]
         for answer in self._seen:
-            if answer.suits(active, assumed):
+            if answer.suits(holding, assumed):
                 found &= answer.conclusions
 
         def keep(model: clingo.Model) -> None:
@@ -388,9 +396,13 @@ class Axioms:
             else:
                 found = [evidence.refuse(self._trace, answer.ssh_map)] if any(axiom == evidence.axiom for axiom, _ in active) else []
             for refusal in filter(None, found):
-                if not self._pairs or (answer.has(refusal) and (evidence.axiom, _last_step(refusal)) in active):
+                if not self._pairs or (answer.has(refusal) and (evidence.axiom, self._judged_at(evidence.axiom, refusal)) in active):
                     return evidence.axiom, refusal
         return None
+
+    def _judged_at(self, axiom: str, refusal: Refusal) -> int:
+        """The step at which an axiom has to be active for this to be refused."""
+        return len(self._trace) - 1 if axiom == Planar.axiom else _last_step(refusal)
 
     def _refused_together(self, displacement: Displacement, answer: _Answer, step: int) -> Refusal | None:
         """Two returns of an answer that are refused together, the later of which ends at a step."""

@@ -539,6 +539,11 @@ def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = 
     return f":- {', '.join(atoms)}."
 
 
+def rests_on(axiom: str, t: int, other: str) -> str:
+    """The rule that where an axiom is active at step t, another one holds at every step."""
+    return f":- {active(axiom, t)}, violation({other},T)."
+
+
 def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
     """The rules that say: some doubt holds where this one is open, and two things are one (or are not); the condition of that is None where they never are."""
     rules = [f"#external {open_doubt(number)}."]
