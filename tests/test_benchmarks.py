@@ -82,10 +82,10 @@ def test_small_traces_are_those_of_the_tables() -> None:
 
 
 def test_a_cell_has_all_its_fields() -> None:
-    ours = bench.run("ssh-abduction", SUITE["full aces3"], 0, 5, 4096)
+    ours = bench.run("ssh-abduction", SUITE["full aces3"], 0, 100, 4096)
     assert ours.keys() == ALWAYS | MEASURED | OURS
     assert (ours["status"], ours["dstates"], ours["proven"], ours["images"], ours["theory"]) == ("ok", 19, True, 23, "full")
-    theirs = bench.run("plain.lp", SUITE["rectangle n=400"], 0, 5, 4096)
+    theirs = bench.run("plain.lp", SUITE["rectangle n=400"], 0, 100, 4096)
     assert theirs.keys() == ALWAYS | MEASURED | {"dstates", "proven"}
     assert (theirs["status"], theirs["dstates"], theirs["true_dstates"]) == ("ok", 4, 8)
 

@@ -85,11 +85,11 @@ def test_without_any_one_axiom_the_rectangles_steps_may_be_one() -> None:
     assert derivation is not None
     for dropped in (None, *derivation.axioms):
         theory = only(Theory(same=[(0, 4)]), {*derivation.axioms, "asserted"} - {dropped})
-        solution = solve(RECTANGLE.prefix(5), theory, limit=10, maps=1)
+        solution = solve(RECTANGLE.prefix(5), theory, limit=100, maps=1)
         assert solution.status is (Status.UNSATISFIABLE if dropped is None else Status.OPTIMAL)
 
 
-@settings(max_examples=32, deadline=None, derandomize=True)
+@settings(max_examples=32, derandomize=True)
 @given(st.data())
 def test_verdicts_are_those_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=5), label="trace")
@@ -110,7 +110,7 @@ def compare(trace: Trace, theory: Theory, first: int, second: int) -> PairExplan
     consistent = [labels[first] == labels[second] for (labels, *rest), _ in consistent_maps(trace, theory) if allows((labels, *rest))]  # type: ignore[arg-type]
     _, minimal = minimal_maps(trace, theory, allows)
     ones = [labels[first] == labels[second] for labels, *_ in minimal]
-    explanation = explain_pair(trace, first, second, theory, limit=20, maps=0)
+    explanation = explain_pair(trace, first, second, theory, limit=100, maps=0)
     if not consistent:
         assert explanation.verdict is Verdict.NO_MAP
     elif len(set(consistent)) == 1:

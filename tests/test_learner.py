@@ -144,7 +144,7 @@ def test_other_clusterings_can_be_plugged_in(run: Trace) -> None:
 
 def test_the_learner_is_an_estimator(run: Trace, hall: Trace) -> None:
     clusterer = ViewClusterer(k_max=6, random_state=0)
-    learner = BootstrapLearner(VIEWS_ALONE, clusterer, limit=20)
+    learner = BootstrapLearner(VIEWS_ALONE, clusterer, limit=100)
     again = clone(learner).set_params(choose=0)
     assert again.get_params()["clusterer__k_max"] == 6
     assert (again.choose, learner.choose, again.theory) == (0, None, VIEWS_ALONE)
@@ -193,7 +193,7 @@ def test_clusterers_of_others_make_the_views(run: Trace, clusterer: Any) -> None
 def test_an_image_that_is_noise_is_not_learnt_from(run: Trace) -> None:
     odd = replace(run, steps=(*run.steps[:-1], replace(run.steps[-1], image=tuple(0.7 * r for r in run.steps[-1].image))))
     with pytest.warns(ImageWarning, match=r"1 of 96 images are like those of no view.*\(image 95\)"):
-        learner = BootstrapLearner(VIEWS_ALONE, DBSCAN(eps=1.5), limit=10).fit(odd)
+        learner = BootstrapLearner(VIEWS_ALONE, DBSCAN(eps=1.5), limit=100).fit(odd)
     assert (learner.views_[-1], learner.confidence_[-1], learner.labels_[-1]) == (-1, 0, -1)
     assert (learner.labels_[:-1] >= 0).all()
     assert set(learner.recogniser_.classes_) == set(learner.labels_[:-1].tolist())

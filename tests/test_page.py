@@ -257,7 +257,7 @@ def server() -> Iterator[PageServer]:
 
 
 def asked(server: PageServer, method: str, path: str, body: Any = None, **headers: str) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=100)
     text = None if body is None else json.dumps(body)
     connection.request(method, path, text, {"Content-Type": "application/json", **headers})
     answer = connection.getresponse()
@@ -295,7 +295,7 @@ def sleep(*arguments: object) -> None:
 
 
 def until(happened: Callable[[], bool]) -> None:
-    end = time.monotonic() + 20
+    end = time.monotonic() + 100
     while not happened():
         assert time.monotonic() < end
         time.sleep(0.02)

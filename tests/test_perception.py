@@ -105,7 +105,7 @@ def test_errors_of_perception_are_the_packages() -> None:
 # M
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 60), st.integers(1, 6), st.integers(2, 5), st.sampled_from(["normal", "grid", "offset"]))
 def test_quality_is_the_ratio_over_all_pairs(seed: int, count: int, beams: int, clusters: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
@@ -232,7 +232,6 @@ def test_one_lost_beam_changes_m_and_not_trimmed_m() -> None:
 # U
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3), st.sampled_from("abcd")), min_size=1, max_size=40))
 def test_uncertainty_is_information_over_entropy(pairs: list[tuple[int, str]]) -> None:
     seen, truth = zip(*pairs, strict=True)

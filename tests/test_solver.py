@@ -13,6 +13,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,14 @@ def too_hard() -> Trace:
     return wandering(3, rooms=60, length=1500, views=2)
 
 
+@contextmanager
+def clock() -> Iterator[Callable[[float], None]]:
+    """A clock that is put forward by so many seconds where the test says so, for which it would have to wait otherwise."""
+    now, ahead = time.perf_counter, [0.0]
+    with patch.object(time, "perf_counter", lambda: now() + sum(ahead)):
+        yield ahead.append
+
+
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
 @pytest.mark.parametrize("tour", TOURS)
 def test_prefixes_give_what_solving_at_once_gives(tour: str, theory: Theory) -> None:
@@ -93,7 +102,7 @@ def test_prefixes_of_random_machines(seed: int) -> None:
     assert len(set(by_prefix.maps)) == by_prefix.count
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30, derandomize=True)
 @given(traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory))))
 def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
     """Every prefix is tried, from the shortest, so that replay has all chances to go wrong."""
@@ -228,7 +237,7 @@ def test_nothing_preferred_means_all_consistent_maps() -> None:
 
 def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
     trace = too_hard()
-    solution = solve(trace, Theory.causal(), limit=2)
+    solution = solve(trace, Theory.causal(), limit=1)
     assert solution.stopped == "time limit"
     assert solution.status is Status.FEASIBLE
     assert solution.count == 1
@@ -237,7 +246,6 @@ def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
     assert solution.bound.dstates is not None
     assert solution.bound.dstates <= solution.cost.dstates
     assert check(trace, solution.maps[0], Theory.causal()) == ()
-    assert solution.seconds.total < 20
 
 
 def test_no_time_at_all_is_unknown_not_unsatisfiable() -> None:
@@ -258,9 +266,14 @@ def test_no_time_at_all_still_leaves_a_map_and_a_bound(theory: Theory) -> None:
 
 def test_time_limit_while_listing_keeps_the_proof() -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=())
-    solution = solve(rectangle(24), theory, limit=2, maps=0)
+    search = Search(rectangle(20), theory, limit=1000, maps=0)
+    maps = []
+    for ssh_map in search:
+        maps.append(ssh_map)
+        search._watch._spent += 500  # so that the time is over after two maps
+    solution = search.solution(tuple(maps))
     assert (solution.status, solution.complete, solution.stopped) == (Status.OPTIMAL, False, "time limit")
-    assert solution.count > 0
+    assert solution.count == 2
 
 
 def test_memory_limit_stops_with_a_status() -> None:
@@ -284,10 +297,10 @@ def test_ctrl_c_leaves_the_best_map() -> None:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(2)
+            process.wait(0.5)
         process.send_signal(signal.SIGINT)
         assert process.stdout.read().split()[0] == "interrupted"
-        assert process.wait(20) == 0
+        assert process.wait(100) == 0
 
 
 def test_a_stream_that_is_left_does_not_abort_python() -> None:
@@ -504,19 +517,21 @@ def test_costs_are_right_where_a_map_cannot_show_them() -> None:
 
 def test_the_time_of_the_caller_does_not_count() -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
-    search = Search(drive(*TOURS["comb"]), theory, maps=5, limit=2)
-    for _ in search:
-        time.sleep(0.5)
+    search = Search(drive(*TOURS["comb"]), theory, maps=5, limit=1000)
+    with clock() as later:
+        for _ in search:
+            later(500)
     assert (search.count, search.stopped) == (5, "maps limit")
 
 
 def test_the_clock_runs_on_for_an_explanation() -> None:
-    search = Search(Trace.from_steps("abcd", ["travel", "around", "around"]), limit=1)
-    assert list(search) == []
-    assert search.status is Status.UNSATISFIABLE
-    assert not search.over()
-    time.sleep(1.1)
-    assert search.over()
+    search = Search(Trace.from_steps("abcd", ["travel", "around", "around"]), limit=1000)
+    with clock() as later:
+        assert list(search) == []
+        assert search.status is Status.UNSATISFIABLE
+        assert not search.over()
+        later(1001)
+        assert search.over()
     assert search.stopped == "time limit"
 
 
@@ -543,7 +558,7 @@ def shape(ssh_map: SSHMap) -> tuple[object, ...]:
     return ssh_map.labels, tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30, derandomize=True)
 @given(traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory))))
 def test_renaming_and_mirroring_leave_the_maps_alone(case: tuple[Trace, Theory]) -> None:
     trace, theory = case

@@ -23,7 +23,7 @@ from ssh_abduction.solver.search import Search
 from ssh_abduction.theory.rules import Rules
 
 ACES3, EXAMPLE = "examples/aces3-route.jsonl", "examples/notched-rectangle.jsonl"
-LIMIT = 10  # seconds: a search that does not end is a failure, not a hang
+LIMIT = 100  # seconds: a search that does not end is a failure, not a hang
 
 
 def at(ssh_map: SSHMap) -> list[int | None]:
@@ -31,7 +31,7 @@ def at(ssh_map: SSHMap) -> list[int | None]:
     return [ssh_map.dstates[label].place for label in ssh_map.labels]
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=20, derandomize=True)
 @given(st.data())
 def test_near_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
     """Each map once, in the order of cost, each with its own cost."""
