@@ -12,14 +12,17 @@ from instances import maze
 from strategies import traces
 
 from ssh_abduction import Search, Speedups, Status, Theory, Trace, solve
+from ssh_abduction.asp.facts import most_paths
 from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.engines import frameless as ways
 from ssh_abduction.engines import naming as named
 from ssh_abduction.engines.base import Task
 from ssh_abduction.engines.frameless import FramelessEngine
+from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.judge.checker import check
 from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.solver import search as solver
+from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -61,6 +64,33 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
     assert len(found) == len(expected.maps)
     assert best.cost == expected.cost.preferred_by(theory)
     assert engine.bound == best.cost[0]
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(st.data())
+def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.DataObject) -> None:
+    """Two returns of a minimal map, to dstates or to places, are forbidden: the maps that are left are those of the readable encodings, which are told the same."""
+    trace = data.draw(traces(max_steps=9), label="trace").without_stars().without_displacements()
+    task = Task.of(trace, data.draw(bare_theories(), label="theory").resolve(trace))
+    plain, engine = StepEngine(task, most_paths(trace, task.theory, len(trace))), FramelessEngine(task)
+    plain.grow(len(trace))
+    engine.grow(len(trace))
+    for _ in range(2):
+        least = [found.cost for found in plain.improving_maps()][-1:]
+        if not least:
+            return  # the engine is asked only where some map is known
+        *_, best = engine.improving_maps()
+        expected = {found.map for found in plain.maps_of_cost(least[0], 0)}
+        assert {found.map for found in engine.maps_of_cost(best.cost, 0)} == expected
+        minimal = min(expected, key=repr)
+        label = minimal.labels
+        one_dstate = [Equality(i, j) for j in range(len(trace)) for i in range(j) if label[i] == label[j]]
+        one_place = [Equality(i, j, "place") for j in range(len(trace)) for i in range(j) if minimal.place_of(i) == minimal.place_of(j)]
+        if not one_place:
+            return
+        refused = data.draw(st.sets(st.sampled_from(one_dstate + one_place), min_size=1, max_size=2), label="refused")
+        assert plain.forbid(refused)
+        assert engine.forbid(refused)
 
 
 def test_a_limit_while_labels_are_listed_is_a_limit() -> None:

@@ -752,18 +752,19 @@ def paths_frameless_facts(
     dstates: Iterable[int],
     links: Iterable[tuple[int, int, int]],
     actions: Mapping[int, Action],
-    far: Iterable[tuple[int, int]] = (),
+    far: Iterable[Collection[tuple[int, int]]] = (),
     *,
     single: bool = False,
 ) -> str:
     """Dstates, the numbered actions that link them, and what is preferred, as facts for paths_frameless.lp.
 
-    far     pairs of dstates that evidence says are not at one place
+    far     pairs of dstates of which, as evidence says, one or more are not at one place: mostly a single pair
     single  ask only for places and paths in which no two places and no two segments are one, unless they have to be
     """
     facts = [sides_framed_facts(theory), *(["total."] if theory.path_order == "total" else []), *(["single."] if single else [])]
     facts += [f"is({x})." for x in dstates]
-    facts += [f"far({x},{y})." for x, y in far]
+    for number, pairs in enumerate(far):
+        facts += [f"far({x},{y})." if len(pairs) == 1 else f"far({number},{x},{y})." for x, y in pairs]
     done = [(s, actions[a], x) for s, a, x in links]
     facts += [f"turn({s},{action.turn},{x})." if action.turn else f"travel({s},{x})." for s, action, x in done if action.kind]
     return "\n".join([*facts, *_preferred(theory)])

@@ -42,8 +42,28 @@ CONTRARY = 8
 # After so many conflicts better paths are no longer sought one after another; the bound is raised from below instead.
 BETTERING = 20_000
 
-_Far: TypeAlias = tuple[int, int, int, int]  # two dstates that are not at one place, and two steps at them of which evidence says so
 _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...]]  # labels of all steps, and options of clasp
+
+
+@dataclass(frozen=True)
+class _Far:
+    """Pairs of dstates of which one or more are not at one place, mostly a single pair.
+
+    pairs   of dstates
+    placed  steps, each with the dstate that it is at, of which evidence says so
+    """
+
+    pairs: tuple[tuple[int, int], ...]
+    placed: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, labels: Sequence[int], equalities: Collection[Equality]) -> _Far | None:
+        """What it says of labels that equalities do not all hold; None where some do not hold anyway, as their steps are not one dstate."""
+        steps = dict.fromkeys(step for equality in equalities for step in (equality.first, equality.second))
+        if max(steps) >= len(labels) or any(e.of == "dstate" and labels[e.first] != labels[e.second] for e in equalities):
+            return None
+        pairs = {(labels[e.first], labels[e.second]): None for e in equalities if e.of == "place"}
+        return cls(tuple(pairs), tuple((step, labels[step]) for step in steps))
 
 
 @dataclass(frozen=True)
@@ -57,10 +77,10 @@ class _Members:
     def of(cls, members: Iterable[Link | _Far]) -> _Members:
         links, far = list[Link](), list[_Far]()
         for member in members:
-            if len(member) == 3:
-                links.append(member)
-            else:
+            if isinstance(member, _Far):
                 far.append(member)
+            else:
+                links.append(member)
         return cls(links, far)
 
     def all(self) -> list[Link | _Far]:
@@ -154,10 +174,9 @@ class FramelessEngine:
         )
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
-        if any(equality.of == "place" for equality in equalities):
-            return False
         self._best = None
-        self._named.forbid_together([(equality.first, equality.second) for equality in equalities])
+        self._fitting.forbid_together(equalities)
+        self._named.forbid_together([(equality.first, equality.second) for equality in equalities])  # as one dstate is at one place
         return True
 
     def settle(self) -> None:
@@ -175,6 +194,7 @@ class PlacesAndPaths:
     def __init__(self, task: Task, asker: Asker) -> None:
         self._task, self._asker = task, asker
         self._actions = dict(zip(task.log.actions, task.trace.actions, strict=True))
+        self._refused: list[Collection[Equality]] = []  # sets of which not all hold, and some of which are of places
         self._forbidden = 0  # sets of links, so far
         self._told: set[tuple[int, int]] = set()  # dstates of whose paths clingo was told, as `NamedLabels.names` has them
         self._asked: tuple[_Question, clingo.Control] | None = None  # the last labels, and the control for their places and paths
@@ -187,6 +207,12 @@ class PlacesAndPaths:
         told, self._told = self._told, set()
         if told:
             self._tell_of([key for key in self.named.names() if key in told])
+
+    def forbid_together(self, equalities: Collection[Equality]) -> None:
+        """From now on not all of these equalities hold."""
+        if any(equality.of == "place" for equality in equalities):
+            self._refused.append(equalities)
+            self._asked = None
 
     def _tell_of(self, dstates: Collection[tuple[int, int]]) -> None:
         """Tell clingo what the paths of these dstates demand, of which it does not know yet."""
@@ -221,7 +247,7 @@ class PlacesAndPaths:
             self._tell_of(new)
             return
         members = _Members.of(smaller(_Members([*links], self._far_away(labels)).all(), self._clashing))
-        placed = {end for far in members.far for end in ((far[2], far[0]), (far[3], far[1]))}
+        placed = {at for far in members.far for at in far.placed}
         self.named.add_links_at({step for step, _ in placed})
         self._forbidden += 1
         self.named.tell(f"forbidden_{self._forbidden}", facts.forbidden_links(members.links, placed))
@@ -233,10 +259,11 @@ class PlacesAndPaths:
         return None if found else members
 
     def _far_away(self, labels: Sequence[int]) -> list[_Far]:
-        """The dstates that are not at one place, as evidence says of steps at them; each pair once."""
+        """The dstates that are not at one place, as evidence says of steps at them; each pair once, and what is said of several pairs together."""
         away = self._task.log.pairs.elsewhere.items()
         found = {(labels[i], labels[t]): (i, t) for t, others in away if t < len(labels) for i in others}
-        return [(*dstates, *steps) for dstates, steps in found.items()]
+        alone = [_Far((pair,), tuple(zip(steps, pair, strict=True))) for pair, steps in found.items()]
+        return alone + [far for equalities in self._refused if (far := _Far.of(labels, equalities))]
 
     def _links_of(self, labels: Sequence[int]) -> list[Link]:
         """The links that these labels of all steps make, each once."""
@@ -255,10 +282,9 @@ class PlacesAndPaths:
         """A control for the places and paths of dstates that are linked so, and of these."""
         control = Control(options, self._asker.watch.check, PREPARING)
         control.load_encodings("paths_frameless", "preference")
-        dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links), *(f[:2] for f in far)))
-        control.add(
-            "base", [], facts.paths_frameless_facts(self._task.theory, dstates, links, self._actions, [f[:2] for f in far], single=single)
-        )
+        apart = [member.pairs for member in far]
+        dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links), *chain(*apart)))
+        control.add("base", [], facts.paths_frameless_facts(self._task.theory, dstates, links, self._actions, apart, single=single))
         control.ground([(part, []) for part in parts])
         return control
 

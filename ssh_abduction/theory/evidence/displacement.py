@@ -42,7 +42,8 @@ _Tested: TypeAlias = "dict[bool, tuple[Steps, Steps]]"
 
 # So many loops are worked on in one go: their sums take some hundred megabytes.
 AT_A_TIME = 200_000
-# So many maps of one trace that were accepted are remembered, as they may be asked about again, or go on as the trace grows.
+# So many maps of one trace that were accepted are remembered, as they may be asked about again, or go on as the trace grows; and so many sets that were refused,
+# as the next maps mostly have them, too.
 REMEMBERED = 64
 
 
@@ -137,6 +138,7 @@ class Returns:
         self.evidence, self.trace = evidence, trace
         self.reckoning: Reckoning = reckoning or Reckoning(trace, before.reckoning if before else None)
         self._accepted: dict[_Course, Together] = dict(before._accepted) if before else {}  # the last one last
+        self._refused: list[frozenset[Equality]] = list(before._refused) if before else []  # sets of two returns, the last one last
         self._pairs: Pairs | None = before._pairs if before else None
         self._likely: int | None = before._likely if before else None
         if before and (self._pairs is not None or self._likely is not None):
@@ -287,7 +289,7 @@ class Returns:
         return ordered
 
     def refused_together(self, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        """The two returns of a map that are refused together most clearly; None where no two are.
+        """Two returns of a map that are refused together: those of a map that was asked about before, or those that are most clearly; None where no two are.
 
         since  the map of the steps before this one is known to be a map of these: only returns that end later are asked about
         """
@@ -297,6 +299,8 @@ class Returns:
         course = _Course.of(labels, places)
         if course in self._accepted:
             return None
+        if (known := next((found for found in reversed(self._refused) if _hold(found, labels, places)), None)) is not None:
+            return known
         before = self._accepted.pop(_Course.of(labels[:since], places), None)
         rows = self._returns_of(labels, places, since if before else 0)
         if before:
@@ -304,7 +308,9 @@ class Returns:
         together = self._together(rows, before)
         worst = together.worst(rows[:, 1] >= since if since else self._is_new(rows))
         if worst is not None:
-            return frozenset(Equality(int(i), int(j), "dstate" if one_dstate else "place") for i, j, one_dstate in worst)
+            refused = frozenset(Equality(int(i), int(j), "dstate" if one_dstate else "place") for i, j, one_dstate in worst)
+            self._refused = [*self._refused[-REMEMBERED:], refused]
+            return refused
         self._accepted[course] = together
         if len(self._accepted) > REMEMBERED:
             del self._accepted[next(iter(self._accepted))]
@@ -453,6 +459,23 @@ class _Course(NamedTuple):
     def of(labels: tuple[int, ...], places: tuple[int | None, ...]) -> _Course:
         """Of the dstates that these steps know: a map may have more, as it grows."""
         return _Course(labels, places[: max(labels, default=-1) + 1])
+
+
+def _hold(equalities: Collection[Equality], labels: Sequence[int], places: Sequence[int | None]) -> bool:
+    """Whether all of these equalities hold, of two steps each, the first of which comes first.
+
+    labels  the dstate of each step
+    places  the place of each dstate
+    """
+    return all(
+        equality.second < len(labels)
+        and (
+            labels[equality.first] == labels[equality.second]
+            if equality.of == "dstate"
+            else places[labels[equality.first]] == places[labels[equality.second]] is not None
+        )
+        for equality in equalities
+    )
 
 
 def _parts(size: int, most: int = AT_A_TIME) -> Iterator[slice]:
