@@ -4,7 +4,8 @@
     python examples/sweep.py out --worlds plans/*.xml --seeds 5 --scheduler tcp://host:8786
 
 Each drive is simulated once, as a log. Each theory maps all logs with one call of `ssh-abduction map`, which can use the workers of a Dask cluster, and which does not do again what is done: so a sweep that was stopped is
-begun once more. One line for each solve goes to rows.jsonl: the maps themselves, and each rung of the ladder.
+begun once more. One line for each solve goes to rows.jsonl: the maps themselves, and each rung of the ladder. Then a table is printed: of the drives, how many have a map, and how many only one; and of the pairs of
+visits that the first maps have at one place, and of those that truly are, which shares are the same pairs.
 
 *On a hundred machines,* as a plan that nobody has run yet: 17 floor plans x 5 tours x 9 theories x 5 rungs are 3,825 solves in 765 runs, which their limits keep to about two minutes each: half a day for two
 processors, and ten minutes for a hundred machines of two. A scheduler runs on one of them
@@ -16,10 +17,19 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from statistics import median
+from typing import Any
 
 from ssh_abduction.cli import main as shell
+from ssh_abduction.evaluation import evaluate_visits
+from ssh_abduction.solver.result import Solution
+from ssh_abduction.trace import Trace
 
+Row = dict[str, Any]
+
+INTERRUPTED = 130  # the exit code after Ctrl-C
 # What each theory is asked with. Where none is named, it is the one that suits the walls of the building, with what is said laid over it.
 THEORIES = {
     "as it suits": [],
@@ -43,45 +53,75 @@ def main() -> None:
     parser.add_argument("--time-limit", default="30", help="seconds for the maps of a log (default: 30)")
     parser.add_argument("--scheduler", help="address of a Dask scheduler; without it, one process a core")
     options = parser.parse_args()
-    logs = [drive(world, seed, options.folder) for world in options.worlds for seed in range(options.seeds)]
+    names = [Path(world).name.partition(".")[0] for world in options.worlds]
+    if len(set(names)) < len(names):
+        parser.error("--worlds: expected worlds with different names, as logs and folders are named after them")
+    tours = [drive(world, seed, options.folder) for world in options.worlds for seed in range(options.seeds)]
+    logs = [log for log in tours if log.exists()]
+    if not logs:
+        parser.exit(1, "no drive was made, as said above\n")
     where = ["--scheduler", options.scheduler] if options.scheduler else ["--jobs", "-1"]
     rows = []
     for theory in options.theories:
         runs = options.folder / theory.replace(", ", "-").replace(" ", "-")
         folder = runs if len(logs) > 1 else runs / logs[0].stem  # a log that stands alone has the folder that is named
-        shell(["map", *map(str, logs), "-o", str(folder), "--time-limit", options.time_limit, *where, *THEORIES[theory], "-q"])
+        code = shell(["map", *map(str, logs), "-o", str(folder), "--time-limit", options.time_limit, *where, *THEORIES[theory], "-q"])
+        if code == INTERRUPTED:
+            parser.exit(code, "stopped; the same command goes on from here\n")
         rows += [row for log in logs for row in rows_of(theory, runs / log.stem)]
     text = "".join(json.dumps(row) + "\n" for row in rows)
     (options.folder / "rows.jsonl").write_text(text, encoding="utf-8")
-    print(f"{len(rows)} solves in {options.folder / 'rows.jsonl'}")
+    failed = f"; {len(tours) - len(logs)} of {len(tours)} drives were not made" if len(logs) < len(tours) else ""
+    print(f"{len(rows)} solves in {options.folder / 'rows.jsonl'}{failed}")
+    print("\n".join(table(rows)))
 
 
 def drive(world: str, seed: int, folder: Path) -> Path:
-    """The log of a drive, made unless it is there."""
-    log = folder / "logs" / f"{Path(world).stem}-{seed}.log"
+    """The log of a drive, made unless it is there. Where the robot cannot drive there, it is not there afterwards."""
+    log = folder / "logs" / f"{Path(world).name.partition('.')[0]}-{seed}.log"
     if not log.exists():
         log.parent.mkdir(parents=True, exist_ok=True)
         shell(["simulate", world, "--as", "carmen", "--seed", str(seed), "-o", str(log), "-q"])
     return log
 
 
-def rows_of(theory: str, run: Path) -> list[dict[str, object]]:
-    """A row for the maps of a run, and one for each rung of its ladder."""
+def rows_of(theory: str, run: Path) -> list[Row]:
+    """A row for the maps of a run, which says how right the first one is, and one for each rung of its ladder."""
     if not (run / "run.json").exists():
         return [{"log": run.name, "theory": theory, "rung": None, "status": "error"}]
     told = json.loads((run / "run.json").read_text(encoding="utf-8"))
-    whole = {"name": "maps", **{name: told[name] for name in ("status", "count", "cost")}}
+    whole = {"name": "maps", **{name: told[name] for name in ("status", "complete", "count", "cost")}, "pairs": pairs_of(run)}
     return [
         {
             "log": run.name,
             "theory": theory,
             "rung": solve["name"],
-            "status": solve["status"],
-            "count": solve["count"],
-            "cost": solve["cost"],
+            **{name: solve[name] for name in ("status", "complete", "count", "cost")},
+            **({"pairs": solve["pairs"]} if "pairs" in solve else {}),
         }
         for solve in (whole, *told["ladder"])
     ]
+
+
+def pairs_of(run: Path) -> dict[str, int] | None:
+    """Of the pairs of visits of a run: how many its first map has at one place, how many of these are, and how many are in truth. None where it has no map."""
+    maps = Solution.load(run / "maps.json").maps[:1]
+    places = evaluate_visits(maps, Trace.load(run / "trace.jsonl")).maps[0].places if maps else None
+    return {name: getattr(places, name) for name in ("joined", "right", "returns")} if places else None
+
+
+def table(rows: Sequence[Row]) -> Iterator[str]:
+    """A line for each theory and rung."""
+    yield f"{'theory':<22}{'rung':<14}{'drives':>7}{'mapped':>8}{'unique':>8}{'places':>8}{'precision':>11}{'recall':>8}"
+    for theory, rung in dict.fromkeys((row["theory"], row["rung"]) for row in rows):
+        some = [row for row in rows if (row["theory"], row["rung"]) == (theory, rung)]
+        costs = [row["cost"] for row in some if row.get("cost")]
+        unique = sum(row.get("status") == "optimal" and row.get("complete") and row.get("count") == 1 for row in some)
+        places = f"{median(cost['places'] for cost in costs):g}" if costs else ""
+        pairs = [row["pairs"] for row in some if row.get("pairs")]
+        joined, right, returns = (sum(found[name] for found in pairs) for name in ("joined", "right", "returns"))
+        precision, recall = (f"{right / n:.2f}" if n else "" for n in (joined, returns))
+        yield f"{theory!s:<22}{rung or 'error':<14}{len(some):>7}{len(costs):>8}{unique:>8}{places:>8}{precision:>11}{recall:>8}"
 
 
 if __name__ == "__main__":
