@@ -443,7 +443,7 @@ def edited(path: FilePath, change: Callable[[dict[str, object]], object]) -> Fil
     [
         (lambda d: d["maps"][1]["labels"].__setitem__(4, 0), "maps[1]: id: expected "),
         (lambda d: d["maps"][1].update(id="no"), "maps[1]: id: expected "),
-        (lambda d: d.update(maps=[]), "expected maps to compare, got none"),
+        (lambda d: d.update(maps=[]), "expected maps, got none"),
         (lambda d: d.update(maps=5), "maps: expected a list, got 5"),
         (lambda d: d.update(steps=7), "steps: expected 23, as map 1 has, got 7"),
         (lambda d: d.update(complete="yes"), "complete: expected true or false, got 'yes'"),
@@ -485,7 +485,7 @@ def test_maps_of_other_traces_are_refused(file_of: Callable[..., FilePath], caps
         ([maps[0], 5], "maps[1]: expected a map, got 5"),
         ("maps.json", "maps: expected a solution or maps, got 'maps.json'; read a file with Listing.load"),
         (7, "maps: expected a solution or maps, got 7"),
-        ([], "maps: expected maps to compare, got none"),
+        ([], "maps: expected maps, got none"),
     ):
         with pytest.raises(MapError) as error:
             compare(wrong)  # type: ignore[arg-type]

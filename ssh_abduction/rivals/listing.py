@@ -18,6 +18,7 @@ from typing import Any, TypeAlias
 
 from ssh_abduction.errors import MapError, brief, is_whole, named
 from ssh_abduction.maps import ID_LENGTH, SSHMap, maps_of, read_json
+from ssh_abduction.solver.recorded import theory_in
 from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.theory.theory import Theory
@@ -86,7 +87,18 @@ class Listing:
             raise MapError(
                 f"{where}: steps: expected {len(maps[0].labels)}, as map 1 has, got {brief(told['steps'])}; solve the trace again"
             )
-        theory = Theory.from_dict(told["theory"]) if "theory" in told else None
+        first_with: dict[str, int] = {}
+        for i, ssh_map in enumerate(maps):
+            if (known := first_with.setdefault(ssh_map.id, i)) != i:
+                raise MapError(f"{where}: maps[{i}]: expected another map, got that of maps[{known}] again; leave it out")
+        theory = theory_in(told["theory"], where) if "theory" in told else None
+        status, count = told.get("status"), told.get("count", len(maps))
+        if status is not None and status not in [known.value for known in Status]:
+            raise MapError(
+                f"{where}: status: expected one of {', '.join(known.value for known in Status)}, got {brief(status)}; solve again"
+            )
+        if not is_whole(count) or count < 0:
+            raise MapError(f"{where}: count: expected how many minimal maps were found, got {brief(count)}; solve again")
         levels = told.get("levels")
         minimal: Any = len(maps)
         if levels is not None:
@@ -102,7 +114,7 @@ class Listing:
         backbone = None
         if maps and "backbone" in told:
             backbone = Backbone.from_dict(told["backbone"], len(maps[0].labels), f"{where}: backbone")
-        is_optimal = told.get("status") == "optimal"
+        is_optimal = status == Status.OPTIMAL.value
         listed = complete or (minimal < len(maps)) if is_optimal else complete
         listing = cls(maps, minimal if is_optimal else None, listed, told.get("stopped"), backbone, where)
         return listing.checked(one_view=theory is None or _has_one_view(theory))
@@ -113,7 +125,7 @@ class Listing:
         one_view  whether dstates have one view each, so that maps tell what was seen at each step
         """
         if not self.maps:
-            raise MapError(f"{self.source}: expected maps to compare, got none; see the status that solve gave")
+            raise MapError(f"{self.source}: expected maps, got none; see the status that solve gave")
         first = None
         for i, ssh_map in enumerate(self.maps):
             if len(ssh_map.labels) != self.steps:
