@@ -21,6 +21,7 @@ from ssh_abduction.maps import SSHMap
 from ssh_abduction.odometry import between, moved
 from ssh_abduction.rungs import Rung
 from ssh_abduction.solver.result import Solution
+from ssh_abduction.words import counted
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]
@@ -192,7 +193,7 @@ def _time(run: Mapping[str, Any]) -> str:
 def _log(log: RobotLog, run: Mapping[str, Any]) -> str:
     said = [f"{log.source}: {log.format}, {len(log)} scans.", *log.notes]
     if log.damaged:
-        said.append(f"{len(log.damaged)} damaged parts were skipped; the first ones:")
+        said.append(f"Skipped: {counted(len(log.damaged), 'damaged parts')} of the log. The first ones:")
         said += [f"{damage.line}: {damage.what}" for damage in log.damaged[:10]]
     return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in said) + "</ul>"
 

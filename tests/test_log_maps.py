@@ -169,6 +169,24 @@ def test_a_log_has_a_twentieth_of_its_drive_to_be_mapped_in_less_what_the_import
     assert seconds_left(RobotLog(untimed, source="untimed.log"), imported) == pytest.approx(5.0 / SPEED / 20 - 1.5)
 
 
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["-o", "{file}"], "expected a folder to write, got a file"),
+        (["-o", "{file}/x"], "expected a folder to write, got a file"),
+        (["-o", "x", "--time-limit", "-1"], "--time-limit: expected a number of seconds above 0"),
+        (["-o", "x", "--maps", "-1"], "--maps: expected how many minimal maps to list"),
+    ],
+)
+def test_what_cannot_be_is_said_before_a_log_is_read(
+    tmp_path: Path, flags: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "no.log"
+    file.write_text("no log")
+    assert main(["map", str(file), *(flag.format(file=file) for flag in flags)]) == 1
+    assert said in capsys.readouterr().err
+
+
 def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, other = runs / "hall", tmp_path / "other"
     shutil.copytree(folder, other)

@@ -207,7 +207,7 @@ def read(bag: Bag, scan_topic: str | None, odom_topic: str | None) -> Reading:
     notes: list[str] = []
     scans = _chosen(bag, SCANS, scan_topic, "scan")
     if scans is None:
-        raise LogError(f"{bag.source}: expected scans (messages LaserScan), got none; topics: {bag.listed()}")
+        raise LogError(f"{bag.source}: expected scans (messages LaserScan), got none; topics: {bag.listed()}; record the laser, too")
     odometers = _chosen(bag, ODOMETRY, odom_topic, "odom")
     frame, laser_offset = _first_scan(bag, scans)
     damaged: list[Damage] = []

@@ -116,6 +116,7 @@ class _Found:
     parameters: dict[str, float] = field(default_factory=dict)
     tags: Counter[str] = field(default_factory=Counter)
     graph: Graph = field(default_factory=Graph)
+    damage: str = ""  # of the first scan that cannot be read
 
 
 def looks_like(head: bytes) -> bool:
@@ -135,9 +136,8 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
         raise LogError(f"{source}: expected vertices in lines VERTEX2 or VERTEX_SE2, got none; leave the format out, or name carmen")
     if not found.kinds:
         tags = ", ".join(f"{count} {tag}" for tag, count in found.tags.most_common(5)) or "none"
-        raise LogError(
-            f"{source}: expected scans in lines {', '.join(KINDS)}, got none that can be read (lines: {tags}); record the laser, too"
-        )
+        why = found.damage or "record the laser, too"
+        raise LogError(f"{source}: expected scans in lines {', '.join(KINDS)}, got none that can be read (lines: {tags}); {why}")
     most = max(survey.scans for survey in found.kinds.values())
     kind = next(kind for kind in KINDS if kind in found.kinds and 2 * found.kinds[kind].scans >= most)
     survey, notes = found.kinds[kind], []
@@ -263,7 +263,9 @@ def _survey(file: IO[bytes], source: str, with_graph: bool) -> _Found:
                     survey.unmoved.append(number)
                 since[line.kind] = 0
                 waiting = survey, line, odometer
-        except Damaged:
+        except Damaged as damage:
+            if tag.decode("ascii") in KINDS and not found.damage:
+                found.damage = f"the first is damaged, in line {number}: {damage}"
             continue
         if len(found.tags) < 100 or tag.decode("ascii") in found.tags:
             found.tags[tag[:20].decode("ascii")] += 1

@@ -10,7 +10,7 @@ from typing import IO
 
 from perception.errors import LogError
 from perception.readers import bags, carmen
-from perception.readers.lines import is_gzip, lines, opened
+from perception.readers.lines import LONGEST_LINE, is_gzip, lines, opened
 from perception.readers.scans import Damage, Reading, RobotLog, Scan
 from ssh_abduction.errors import brief, named
 
@@ -89,13 +89,15 @@ def _is_folder(path: str | os.PathLike[str]) -> bool:
 def _format(file: IO[bytes], source: str) -> str:
     """The format of a file by what it holds. Raises LogError where it is none of FORMATS."""
     formats = "; ".join(f"{name} ({what})" for name, what in FORMATS.items())
-    head = b""
+    head, longest = b"", 0
     for _, line in lines(file, source):
         head += (line or b"")[:HEAD]
+        longest = LONGEST_LINE if line is None else longest
         if len(head) > HEAD:
             break
     if not head:
-        raise LogError(f"{source}: expected a robot's log, got an empty file; formats: {formats}")
+        got = f"lines of more than {longest // 2**20} MiB" if longest else "an empty file"
+        raise LogError(f"{source}: expected a robot's log, got {got}; formats: {formats}")
     if (bag := bags.format_of(head)) is not None:
         if is_gzip(file):
             raise LogError(f"{source}: expected a bag ({bag}) as it was recorded, got a gzipped one; unpack it with gunzip")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.options import Verbs, add_output, write
 from ssh_abduction.cli.text import counted
-from ssh_abduction.errors import SSHError
+from ssh_abduction.errors import SSHError, named
 
 if TYPE_CHECKING:
     from perception.readers.scans import RobotLog
@@ -66,6 +67,8 @@ def run(options: argparse.Namespace) -> int:
 
     if options.log == "-":
         raise SSHError("-: expected the file of a log, got standard input; save it to a file")
+    if options.output != "-" and not Path(options.output).absolute().parent.is_dir():
+        raise SSHError(f"{named(options.output)}: cannot write the trace: its folder is not there; make it first")
     log = read(options.log, options)
     warn([*log.notes, *damage(log)])
     done = import_log(log, options.gateway, options.radius, named_after(options.log))
@@ -79,8 +82,6 @@ def run(options: argparse.Namespace) -> int:
 
 def named_after(path: str) -> str:
     """The name of a trace that is made of the log in a file."""
-    from pathlib import Path
-
     return Path(path).name.partition(".")[0]
 
 
@@ -89,4 +90,5 @@ def damage(log: RobotLog) -> list[str]:
     if not log.damaged:
         return []
     first = log.damaged[0]
-    return [f"{counted(len(log.damaged), 'damaged parts')} of the log were skipped; the first is {first.line}: {first.what}"]
+    were = "was" if len(log.damaged) == 1 else "were"
+    return [f"{counted(len(log.damaged), 'damaged parts')} of the log {were} skipped; the first is {first.line}: {first.what}"]

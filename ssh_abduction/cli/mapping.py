@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
 import sys
 import tempfile
 from collections.abc import Callable, Generator
@@ -17,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ssh_abduction.asp.limits import check_limit
 from ssh_abduction.cli import EXIT_ERROR, batch, workers
 from ssh_abduction.cli.import_log import damage, named_after
 from ssh_abduction.cli.options import choices_of, theory_of
@@ -148,6 +150,10 @@ def run(options: argparse.Namespace) -> int:
         raise SSHError("--jobs: expected how many logs to map at a time, or -1 for one a core, got 0; leave it out for 1")
     if "-" in options.logs:
         raise SSHError("-: expected the files of logs, got standard input; save it to a file")
+    if options.maps < 0:
+        raise SSHError(f"--maps: expected how many minimal maps to list, 0 for all, got {options.maps}")
+    check_limit("--time-limit", "seconds", options.time_limit)
+    _check_folder(Path(options.output))
     question = MapQuestion(
         *_theory(options),
         (options.format, options.scan_topic, options.odom_topic),
@@ -195,6 +201,17 @@ def _kept(answers: Generator[MapAnswer], paths: list[str], folders: dict[str, Pa
         print(f"ssh-abduction: errors in {errors} of {len(paths)} logs, on their lines", file=sys.stderr)
         return EXIT_ERROR
     return max(codes)
+
+
+def _check_folder(folder: Path) -> None:
+    """Whether a folder can be made and written, before hours of work. Raises SSHError."""
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise SSHError(f"{named(str(folder))}: expected a folder to write, got a file: {named(str(there))}; name another one")
+    if not os.access(there, os.W_OK):
+        raise SSHError(
+            f"{named(str(folder))}: expected a folder that can be written, got no permission in {named(str(there))}; name another one"
+        )
 
 
 def _folders(logs: list[str], folder: Path) -> dict[str, Path]:
