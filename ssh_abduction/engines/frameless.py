@@ -20,10 +20,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from typing import TypeAlias
 
 import clingo
+import networkx as nx
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker, Control, mapped
@@ -37,7 +38,7 @@ from ssh_abduction.steps.chart import Link, numbered
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 
-# Clingo is told of so many paths in one go: of fewer it would be asked more often, and most of more would not be needed.
+# Clingo is told of so many paths, or of so many pairs of dstates, in one go: of fewer it would be asked more often, and most of more would not be needed.
 CONTRARY = 8
 # After so many conflicts better paths are no longer sought one after another; the bound is raised from below instead.
 BETTERING = 20_000
@@ -246,11 +247,23 @@ class PlacesAndPaths:
         if new:
             self._tell_of(new)
             return
-        members = _Members.of(smaller(_Members([*links], self._far_away(labels)).all(), self._clashing))
-        placed = {at for far in members.far for at in far.placed}
-        self.named.add_links_at({step for step, _ in placed})
-        self._forbidden += 1
-        self.named.tell(f"forbidden_{self._forbidden}", facts.forbidden_links(members.links, placed))
+        far = self._far_away(labels)
+        for members in self._turned_together(links, far) or [_Members.of(smaller(_Members([*links], far).all(), self._clashing))]:
+            placed = {at for apart in members.far for at in apart.placed}
+            self.named.add_links_at({step for step, _ in placed})
+            self._forbidden += 1
+            self.named.tell(f"forbidden_{self._forbidden}", facts.forbidden_links(members.links, placed))
+
+    def _turned_together(self, links: Iterable[Link], far: Iterable[_Far]) -> list[_Members]:
+        """Dstates that are far from each other though turns lead from one to the other, with as few links as lead there; the fewest links first."""
+        turns = nx.Graph((s, x, {"link": (s, action, x)}) for s, action, x in links if self._actions[action].turn)
+        turns.add_nodes_from(dstate for apart in far for dstate in chain(*apart.pairs))
+        found = []
+        for apart in far:
+            if all(nx.has_path(turns, x, y) for x, y in apart.pairs):
+                ways = (nx.shortest_path(turns, x, y) for x, y in apart.pairs)
+                found.append(_Members([turns.edges[pair]["link"] for way in ways for pair in pairwise(way)], [apart]))
+        return sorted(found, key=lambda members: len(members.links))[:CONTRARY]
 
     def _clashing(self, members: list[Link | _Far]) -> list[Link | _Far] | None:
         """These links, and dstates that are far from each other, if no places and paths fit them."""
