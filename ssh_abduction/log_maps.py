@@ -1,7 +1,7 @@
 """From a robot's log to the minimal maps of the building, and to a folder that tells the whole run.
 
 A building whose walls meet at right angles is mapped by the topological theory with stars. Elsewhere stars are too often misread, and what lies right of a path that bends is not to be said: there
-displacements tell places apart, and no sides are asked for.
+displacements tell places apart, and no sides are asked for. The same goes for a building whose stars no map fits, as a junction was passed unnoticed, or one star misread.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ssh_abduction.log_report import report
 from ssh_abduction.logs import log_of
 from ssh_abduction.rivals.page.html import view_page
 from ssh_abduction.rungs import Rung, ladder, rungs
-from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
 
@@ -39,8 +39,13 @@ RUNG = 10.0
 SPEED = 0.5
 # So many minimal maps are listed, and ranked by how well they close.
 MAPS = 300
+# What is said where no map fits the stars that the walls suggested to use.
+NO_STARS = "No map fits the stars of the log: some star was misread, or a place was passed unnoticed. So the log was mapped without stars and sides."
 # Times between scans that are longer than so many times the usual one are gaps of the log, or clocks that jumped: they do not count as driving.
 GAP = 20.0
+
+# The theory of buildings whose stars say nothing that one could rely on.
+BARE = Theory.topological().replace(star="none", boundary="none")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +58,7 @@ class LogMap:
     rungs     what each kind of evidence is worth; empty where that was not asked
     seconds   processor time of each stage, from the track on
     limit     seconds that there were for the minimal maps
+    notes     what is to be said of how it was mapped
     """
 
     log: RobotLog
@@ -61,6 +67,7 @@ class LogMap:
     rungs: tuple[Rung, ...]
     seconds: Mapping[str, float]
     limit: float
+    notes: tuple[str, ...] = ()
 
     @property
     def drove(self) -> float | None:
@@ -85,6 +92,7 @@ class LogMap:
             "scale": asdict(scale),
             "right_angles": trace.extra["right_angles"],
             "theory": solution.theory.to_dict(),
+            "notes": list(self.notes),
             "visits": len(self.imported.visits),
             "steps": len(trace),
             "status": solution.status.value,
@@ -110,9 +118,7 @@ class LogMap:
 
 def theory_for(imported: Imported) -> Theory:
     """The theory that suits the walls of a building."""
-    if imported.trace.extra["right_angles"]:
-        return Theory.topological()
-    return Theory.topological().replace(star="none", boundary="none")
+    return Theory.topological() if imported.trace.extra["right_angles"] else BARE
 
 
 def seconds_driven(log: RobotLog) -> float | None:
@@ -145,7 +151,7 @@ def map_log(
 ) -> LogMap:
     """The minimal maps of a building, from a robot's log.
 
-    theory           the axioms; `theory_for` chooses, where it is None
+    theory           the axioms; `theory_for` chooses, where it is None, and another time if no map satisfies these
     choices          fields of Theory, laid over that: a choice about one thing leaves the others as they suit the log
     gateway, radius  metres, as in perception.places.scale.Scale; what the log suggests, where they are None
     limit            seconds for the minimal maps; None for what is left of a twentieth of the time that the robot drove, and LEAST at least
@@ -162,6 +168,12 @@ def map_log(
     allowed = max(left * (1 - LADDER if with_ladder else 1), LEAST) if limit is None else limit
     begin = time.process_time()
     solution = solve(imported.trace, chosen, limit=allowed, maps=maps)
+    notes: tuple[str, ...] = ()
+    if solution.status is Status.UNSATISFIABLE and theory is None and not {"star", "boundary", "level"} & set(choices or ()):
+        bare = BARE.replace(**choices or {})
+        if bare != chosen:
+            chosen, notes = bare, (NO_STARS,)
+            solution = solve(imported.trace, chosen, limit=allowed, maps=maps)
     seconds["maps"] = round(time.process_time() - begin, 3)
     climbed: tuple[Rung, ...] = ()
     if with_ladder:
@@ -169,4 +181,4 @@ def map_log(
         share = (left - seconds["maps"]) / len(list(rungs(imported.trace, chosen, stars)))
         climbed = tuple(ladder(imported.trace, chosen, limit=min(max(share, LEAST_RUNG), RUNG), maps=1, stars=stars, known=solution))
         seconds["ladder"] = round(time.process_time() - begin, 3)
-    return LogMap(log, imported, solution, climbed, seconds, allowed)
+    return LogMap(log, imported, solution, climbed, seconds, allowed, notes)

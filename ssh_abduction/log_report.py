@@ -51,7 +51,7 @@ def report(log: RobotLog, imported: Imported, solution: Solution, rungs: Sequenc
     name = imported.trace.name or "log"
     parts = [
         f"<h1>{escape(name)}</h1>",
-        f"<p>{escape(_summary(solution, run))}</p>",
+        *map(_paragraph, [_summary(solution, run), *run["notes"]]),
         _figure(log, imported, solution),
         "<h2>What each kind of evidence is worth</h2>" + _ladder(rungs) if rungs else "",
         "<h2>Rival maps</h2>" + _paragraph(solution.summary or "There is no other minimal map.") if solution.maps else "",

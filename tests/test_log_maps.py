@@ -25,7 +25,7 @@ from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.log_maps import SPEED, map_log, seconds_left
 from ssh_abduction.odometry import between
-from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.trace import Trace
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "logs"
@@ -185,6 +185,19 @@ def test_what_cannot_be_is_said_before_a_log_is_read(
     file.write_text("no log")
     assert main(["map", str(file), *(flag.format(file=file) for flag in flags)]) == 1
     assert said in capsys.readouterr().err
+
+
+def test_a_log_whose_stars_no_map_fits_is_mapped_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ahead the way is open, and still at the robot's right once it has turned around."""
+    trace = replace(
+        Trace.from_steps("aba", ["travel", "around"], stars=[(1, 0, 0, 0), (0, 0, 1, 0), (0, 1, 0, 0)]), extra={"right_angles": True}
+    )
+    imported = SimpleNamespace(trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={})
+    monkeypatch.setattr(log_maps, "import_log", lambda *_: imported)
+    log = RobotLog((Scan(np.ones(3), Laser(-1.0, 1.0, 3, 30.0), (0.0, 0.0, 0.0)),), source="x")
+    done, asked = map_log(log, with_ladder=False), map_log(log, choices={"star": "frame"}, with_ladder=False)
+    assert (done.solution.status, done.solution.theory.star, done.notes) == (Status.OPTIMAL, "none", (log_maps.NO_STARS,))
+    assert (asked.solution.status, asked.notes) == (Status.UNSATISFIABLE, ())
 
 
 def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -125,7 +125,7 @@ class MapQuestion:
         how = f"{solution.status.value}, {counted(solution.count, 'minimal maps')}{'' if solution.complete else ' or more'}"
         total = sum(done.seconds.values())
         line = f"{named(path)}: {found}; {how}; {counted(len(done.imported.visits), 'visits')} in {counted(len(log), 'scans')}, {done.imported.track.way[-1]:.0f} m; {total:.1f} s"
-        return MapAnswer(number, line, exit_code(solution), (*damage(log), *solution.warnings), tuple(files.items()))
+        return MapAnswer(number, line, exit_code(solution), (*damage(log), *done.notes, *solution.warnings), tuple(files.items()))
 
     @property
     def has_limits(self) -> bool:
