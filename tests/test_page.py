@@ -40,6 +40,8 @@ from ssh_abduction.cli import main
 from ssh_abduction.cli.options import add_theory, flags_of, theory_of
 from ssh_abduction.maps import Fault, Fit, Pose
 from ssh_abduction.maps import Path as MapPath
+from ssh_abduction.rivals.assumed import assumptions
+from ssh_abduction.rivals.explain import explain_pair
 from ssh_abduction.rivals.page import html
 from ssh_abduction.rivals.page.content import DRAWN, content_of
 from ssh_abduction.rivals.page.html import Page
@@ -242,6 +244,17 @@ def test_view_writes_a_page_with_beliefs(tmp_path: Path, capsys: pytest.CaptureF
         assert said in capsys.readouterr().err
 
 
+def test_what_assumptions_cost_is_what_an_explanation_says() -> None:
+    trace = Trace.from_steps("abab", ["travel", "travel", "around"])
+    solution = solve(trace, maps=0)
+    known = assumptions(Listing.of(solution), trace, Theory(), seconds=1000)
+    assert known == {pair: explain_pair(trace, *pair, maps=0).assuming for pair in known}
+    assert {text for told in known.values() for text in told.values()} > {"no map satisfies the axioms"}
+    agreed = {(i, j) for j in range(4) for i in range(j) if len({m.labels[i] == m.labels[j] for m in solution.maps}) == 1}
+    assert known.keys() == agreed
+    assert assumptions(Listing.of(solution), trace, Theory(), seconds=1e-9) == {}
+
+
 def shown_in(page: str) -> Any:
     return json.loads(Path(page).read_text().partition('<script type="application/json" id="content">')[2].partition("</script>")[0])
 
@@ -370,7 +383,8 @@ class Shown:
 
 def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, Any]) -> None:
     file = tmp_path / "page.html"
-    Page(content).save(file)
+    assuming = {"texts": ["no map satisfies the axioms", "costs nothing, as it holds in every map"], "pairs": {"0,1": [0, 1]}}
+    Page({**content, "assuming": assuming}).save(file)
     page = Shown(browser, file.as_uri())
     assert (
         page["sentence"].text
@@ -387,6 +401,8 @@ def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, An
     assert page["at"].text == "1 of 22"
     assert "in all maps" in page["rivals"].text
     page.click("one")
+    page.choose(0, 1)
+    assert page["costs"].text.split("\n")[1::2] == assuming["texts"]
     page.choose(0, 2)
     assert page["verdict"].text.startswith("Steps 0 and 2: different dstates in every minimal map")
     page.click("same")

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from ssh_abduction.trace import Trace
 
 
+ASSUMING = 3.0  # For so many seconds it is sought what assumptions cost that the page may be asked about.
+
+
 def add_parser(verbs: Verbs) -> None:
     text = "Show maps in the browser, on one page: what all share, where they differ, each map, two side by side, and what happened at each step."
     parser = verbs.add_parser("view", help="see rival maps in the browser", description=text)
@@ -67,13 +70,30 @@ def run(options: argparse.Namespace) -> int:
     if options.serve:
         assert trace is not None
         return _serve(options, listing, trace, theory, localised, called)
-    page = Page(content_of(listing, trace, localised, called))
+    content = content_of(listing, trace, localised, called)
+    if trace is not None and theory is not None:
+        content["assuming"] = _assuming(listing, trace, theory)
+    page = Page(content)
     file = options.output or _temporary()
     page.save(file)
     print(file)
     if not options.output and not options.no_open:
         _open(Path(file).absolute().as_uri())
     return 0
+
+
+def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
+    """What the page knows without a server of what assumptions cost: texts, and by pairs of steps the number of the text for one dstate, and for different ones."""
+    from ssh_abduction.rivals.assumed import assumptions
+
+    try:
+        known = assumptions(listing, trace, theory, ASSUMING)
+    except SSHError:  # the file was made with a theory that does not suit this trace: then nobody can say
+        known = {}
+    texts = list(dict.fromkeys(text for told in known.values() for text in (told["same"], told["different"])))
+    number = {text: k for k, text in enumerate(texts)}
+    pairs = {f"{i},{j}": [number[told["same"]], number[told["different"]]] for (i, j), told in known.items()}
+    return {"texts": texts, "pairs": pairs}
 
 
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:

@@ -702,6 +702,8 @@ function tellVerdict(a, b) {
   for (const side of ["same", "different"]) {
     cost[side] = best[side] === least ? "costs nothing" : best[side] < Infinity ? `${best[side]} dstates in the best map listed, not ${least}` : proven ? `more than the ${least} dstates of these maps, if there is such a map` : "no map listed has them so";
   }
+  const told = data.assuming?.pairs[`${Math.min(a, b)},${Math.max(a, b)}`];
+  if (told && !theory()) [cost.same, cost.different] = told.map((k) => data.assuming.texts[k]);
   tellCosts(cost);
 }
 

@@ -1,0 +1,82 @@
+"""What it costs to assume that two steps are one dstate, or that they are not: of as many pairs as there is time for, before anybody asks.
+
+>>> from ssh_abduction import Trace, solve
+>>> trace = Trace.from_steps(["end", "hall", "end", "end", "hall", "end", "end"], ["travel", "travel", "around", "travel", "travel", "around"])
+>>> known = assumptions(Listing.of(solve(trace)), trace, Theory(), seconds=10)
+>>> known[0, 6]["different"], known[0, 1]["same"]
+('7 dstates, not 6', 'no map satisfies the axioms')
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from ssh_abduction.asp import facts
+from ssh_abduction.engines.base import Cost
+from ssh_abduction.explain import Axioms, Interrupted, Piece
+from ssh_abduction.rivals.explain import SMALL, UNCUT, PairExplanation, Side, Verdict
+from ssh_abduction.rivals.listing import Listing
+from ssh_abduction.solver.result import Status
+from ssh_abduction.solver.search import solve
+from ssh_abduction.theory.theory import Theory
+from ssh_abduction.trace import Trace
+
+Pair = tuple[int, int]
+
+
+def assumptions(listing: Listing, trace: Trace, theory: Theory, seconds: float) -> dict[Pair, dict[str, str]]:
+    """By pairs of steps that all minimal maps have as one dstate, or all have as different ones: what either costs, in words, as `PairExplanation.assuming` has it.
+
+    listing  the minimal maps
+    theory   that which they are minimal by
+    seconds  after so many nothing more is sought: some pairs are not there then
+
+    First it is asked which pairs of the first steps can be otherwise at all, which takes one grounding for all of them; then what the best such map costs, pair by pair.
+    """
+    end = time.monotonic() + seconds
+    theory = theory.resolve(trace)
+    axioms_survive_cuts = not (theory.rules or theory.has_faults)
+    if not listing.minimal or theory.without or (len(trace) > UNCUT and not axioms_survive_cuts):
+        return {}
+    minimal = listing.maps[: listing.minimal]
+    best = Cost.of(minimal[0])
+    known: dict[Pair, dict[str, str]] = {}
+    left: list[tuple[Pair, bool]] = []
+
+    def tell(pair: Pair, one: bool, lost: Side) -> None:
+        won = Side(possible=True, cost=best, proven=True)
+        same, different = (won, lost) if one else (lost, won)
+        verdict = Verdict.SAME_IN_MINIMAL if one else Verdict.DIFFERENT_IN_MINIMAL
+        told = PairExplanation(*pair, verdict, same, different, bool(listing.complete), None, None, None, theory)
+        known[pair] = told.assuming
+
+    piece = Piece.of(trace, theory, range(len(trace) if len(trace) <= UNCUT else SMALL))
+    try:
+        axioms = Axioms(piece, lambda: time.monotonic() > end)
+        for pair, one in _agreed([ssh_map.labels for ssh_map in minimal], len(piece.steps)):
+            if axioms.consistent(assumed=[(facts.are_one(*pair), not one)]):
+                left.append((pair, one))
+            else:
+                tell(pair, one, Side(possible=False))
+    except Interrupted:
+        return known
+    for pair, one in left:
+        if (rest := end - time.monotonic()) <= 0:
+            break
+        field = "different" if one else "same"
+        found = solve(trace, theory.replace(**{field: (*getattr(theory, field), pair)}), limit=rest, maps=1)
+        if found.status is Status.OPTIMAL:
+            tell(pair, one, Side(possible=True, cost=found.cost, proven=True))
+        elif found.status is Status.UNSATISFIABLE:
+            tell(pair, one, Side(possible=False))
+    return known
+
+
+def _agreed(labels: list[tuple[int, ...]], steps: int) -> Iterator[tuple[Pair, bool]]:
+    """Pairs of the first steps of which all maps say the same, and what: whether they are one dstate."""
+    for later in range(steps):
+        for earlier in range(later):
+            said = {of_map[earlier] == of_map[later] for of_map in labels}
+            if len(said) == 1:
+                yield (earlier, later), said.pop()
