@@ -39,7 +39,7 @@ HEAD = (
     "|---|---|---|---|---|---|---|---|---|---|---|",
 )
 SIMULATED = (
-    "| mapper | logs | mapped | isomorphic | places right | stays in rooms noticed | passes noticed | places, median | accuracy, median | edges: precision, recall, medians | pairs: precision, recall, of all logs |",
+    "| mapper | logs | mapped | isomorphic | places right | doors noticed | passes noticed | places, median | accuracy, median | edges: precision, recall, medians | pairs: precision, recall, of all logs |",
     "|---|---|---|---|---|---|---|---|---|---|---|",
 )
 

@@ -55,18 +55,18 @@ class Visit:
 class Truth:
     """What is known of a log, for evaluation only.
 
-    poses   (n, 3): where each scan was taken; metres and radians
-    visits  to the places that a mapper should find, in order; empty where nobody knows which these are
-    stays   in rooms, in order, where nobody knows at which places in a room a mapper should find itself: it should do so somewhere in each
-    doors   where the doors are: x and y by name
-    rooms   the room in which each scan was taken; empty where nobody knows
-    grid    whether places are at crossings of the grid of ACES3, whose corridors are the true paths
-    times   of the scans, in seconds, and relative poses between times that were checked by hand, where there are any
+    poses     (n, 3): where each scan was taken; metres and radians
+    visits    to the places that a mapper should find, in order; empty where nobody knows which these are
+    doorways  the doors that the robot drove through, in order, where nobody knows which other places a mapper should find: in and out by one door is one
+    doors     where the doors are: x and y by name
+    rooms     the room in which each scan was taken; empty where nobody knows
+    grid      whether places are at crossings of the grid of ACES3, whose corridors are the true paths
+    times     of the scans, in seconds, and relative poses between times that were checked by hand, where there are any
     """
 
     poses: Array
     visits: tuple[Visit, ...] = ()
-    stays: tuple[Visit, ...] = ()
+    doorways: tuple[Visit, ...] = ()
     doors: Mapping[str, Sequence[float]] | None = None
     rooms: tuple[str | None, ...] = ()
     grid: bool = False
@@ -86,9 +86,11 @@ class Truth:
     def load(path: Path) -> Truth:
         """What the simulator wrote beside a log."""
         told = json.loads(path.read_text())
-        poses, visits = np.array(told["poses"]), tuple(Visit(visit["place"], visit["first"], visit["last"]) for visit in told["visits"])
+        poses = np.array(told["poses"])
         doors = {name: door["at"] for name, door in told.get("doors", {}).items()}
-        return Truth(poses, stays=visits, doors=doors, rooms=tuple(told["scans"])) if doors else Truth(poses, visits)
+        if doors:
+            return Truth(poses, doorways=doorways_of(told["crossings"], poses), doors=doors, rooms=tuple(told["scans"]))
+        return Truth(poses, tuple(Visit(visit["place"], visit["first"], visit["last"]) for visit in told["visits"]))
 
     def matched(self, scans: Sequence[int]) -> list[int | None]:
         """For each event the visit that it is at; of several events at one visit, the one nearest to its middle. None where it is at none."""
@@ -127,6 +129,19 @@ def visits_of(places: Mapping[str, Sequence[float]], poses: Array, reach: float 
             first = visits.pop().first if visits and visits[-1].place == place else scan
             visits.append(Visit(place, first, scan))
     return tuple(visits)
+
+
+def doorways_of(crossings: Sequence[Mapping[str, Any]], poses: Array) -> tuple[Visit, ...]:
+    """The doors that a robot at these poses drove through, from the last scan within DOOR before it to the last one within DOOR behind it; in and out by one door is one."""
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    found: list[Visit] = []
+    for crossing in crossings:
+        at = way[min(crossing["scan"], len(way) - 1)]
+        first, last = int(np.searchsorted(way, at - DOOR)), int(np.searchsorted(way, at + DOOR, side="right")) - 1
+        if found and found[-1].place == crossing["door"]:
+            first = found.pop().first
+        found.append(Visit(crossing["door"], first, last))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -175,7 +190,7 @@ class Figures:
     """How right a mapper is.
 
     nodes      how many places it has, of those that were visited
-    precision, recall  of events: of its events, the share that is a true visit; of the true visits, or else of the stays in rooms, the share that has an event. None where these are not known
+    precision, recall  of events: of its events, the share that is a true visit; of the true visits, or else of the doors driven through, the share that has an event. None where these are not known
     passes     how often the robot came back to where an event is, and how often there is an event then
     named      accuracy, edges and pairs by the names of the true places, in the terms of `evaluate`
     posed      pairs of events by poses, in the terms of `evaluate`
@@ -224,7 +239,7 @@ class Figures:
 def judged(events: Events, truth: Truth) -> Figures:
     """How right these events are."""
     hits = sum(visit is not None for visit in truth.matched(events.scans))
-    noticed = sum(any(stay.first <= scan <= stay.last for scan in events.scans) for stay in truth.stays)
+    noticed = sum(any(door.first <= scan <= door.last for scan in events.scans) for door in truth.doorways)
     names = truth.names(events.scans, events.poses)
     poses = truth.poses[list(events.scans)] if events.poses is None else events.poses
     numbers = {place: i for i, place in enumerate(dict.fromkeys(events.places))}
@@ -244,7 +259,7 @@ def judged(events: Events, truth: Truth) -> Figures:
         nodes=len(numbers),
         events=len(names),
         precision=hits / len(names) if truth.visits else None,
-        recall=hits / len(truth.visits) if truth.visits else noticed / len(truth.stays) if truth.stays else None,
+        recall=hits / len(truth.visits) if truth.visits else noticed / len(truth.doorways) if truth.doorways else None,
         passes=passes(events, truth),
         named=evaluate([ssh_map], trace),
         posed=evaluate_visits([ssh_map], trace),
@@ -294,8 +309,8 @@ def main() -> None:
         print(
             f"{len(matched)} events, precision {figures.precision:.2f}, recall {figures.recall:.2f}; missed: {' '.join(missed) or 'none'}"
         )
-    if truth.stays:
-        print(f"{len(matched)} events; an event or more in {figures.recall:.0%} of {len(truth.stays)} stays in rooms")
+    if truth.doorways:
+        print(f"{len(matched)} events; an event or more at {figures.recall:.0%} of {len(truth.doorways)} doors driven through")
     print("came back {} times to where an event is, and noticed it {} times".format(*figures.passes))
     if options.output:
         with_names(trace, truth).save(options.output)

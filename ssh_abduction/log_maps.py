@@ -144,6 +144,7 @@ def map_log(
     choices: Mapping[str, Any] | None = None,
     gateway: float | None = None,
     radius: float | None = None,
+    doors: bool | None = None,
     name: str | None = None,
     limit: float | None = None,
     maps: int = MAPS,
@@ -154,13 +155,14 @@ def map_log(
     theory           the axioms; `theory_for` chooses, where it is None, and another time if no map satisfies these
     choices          fields of Theory, laid over that: a choice about one thing leaves the others as they suit the log
     gateway, radius  metres, as in perception.places.scale.Scale; what the log suggests, where they are None
+    doors            whether doors are the places, as in perception.places.importing.import_log; what the log suggests, where it is None
     limit            seconds for the minimal maps; None for what is left of a twentieth of the time that the robot drove, and LEAST at least
     maps             so many of them are listed at most
     with_ladder      whether it is found out, too, what each kind of evidence is worth
 
     Raises LogError, and TheoryError for a theory that does not suit the trace.
     """
-    imported = import_log(log, gateway, radius, name)
+    imported = import_log(log, gateway, radius, name, doors)
     seconds = dict(imported.seconds)
     _log.info("%d visits, %d steps", len(imported.visits), len(imported.trace))
     chosen = (theory or theory_for(imported)).replace(**choices or {})

@@ -170,12 +170,20 @@ def _faults(solution: Solution) -> str:
 
 def _settings(run: Mapping[str, Any]) -> str:
     theory = ", ".join(f"{name} {value}" for name, value in run["theory"].items() if value not in (None, False, [], 0))
-    rows = [
-        ("gateway", f"{run['scale']['gateway']:g} m", "the least width of a way out that counts"),
-        ("radius", f"{run['scale']['radius']:g} m", "how far a way out must lead from the middle of a place"),
-        ("walls", "right angles" if run["right_angles"] else "any angles", "as the ways that the robot took suggest"),
-        ("theory", theory, "the axioms, and the choices in them"),
-    ]
+    rows = (
+        [
+            ("places", "doors", "between rooms that are wide, as the widths of the robot's way suggest; a path leads across a room"),
+            ("theory", theory, "the axioms, and the choices in them"),
+        ]
+        if run["scale"]["doors"]
+        else [
+            ("places", "junctions, corners, dead ends", "where ways part or bend"),
+            ("gateway", f"{run['scale']['gateway']:g} m", "the least width of a way out that counts"),
+            ("radius", f"{run['scale']['radius']:g} m", "how far a way out must lead from the middle of a place"),
+            ("walls", "right angles" if run["right_angles"] else "any angles", "as the ways that the robot took suggest"),
+            ("theory", theory, "the axioms, and the choices in them"),
+        ]
+    )
     return _table(("", "", ""), rows)
 
 

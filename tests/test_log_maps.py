@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import shutil
@@ -11,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_plans import DOORS, MIDDLES, plan_of, xml
 
 from perception.errors import LogError
 from perception.places.importing import Imported, import_log
@@ -19,9 +21,11 @@ from perception.places.scale import Scale
 from perception.places.track import Track, follow
 from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
+from simulator.rounds import record_plan
 from ssh_abduction import SSHError, Theory, log_maps
 from ssh_abduction.cli import batch, main, workers
 from ssh_abduction.cli.mapping import MapQuestion
+from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.log_maps import SPEED, map_log, seconds_left
 from ssh_abduction.odometry import between
@@ -214,7 +218,7 @@ def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.Captur
 
 
 def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_alone(hall: Path, tmp_path: Path) -> None:
-    question = MapQuestion(None, {}, (None, None, None), None, None, 40.0, 1, False)
+    question = MapQuestion(None, {}, (None, None, None), None, None, None, 40.0, 1, False)
     small = tmp_path / "small.log"
     small.write_text("\n".join(hall.read_text().splitlines()[:260]) + "\n")
     (answer,) = batch.here(question, [str(small)], 2, batch.Stop(tmp_path / "stop"))
@@ -235,3 +239,20 @@ def test_the_building_of_the_paper_comes_out_of_its_raw_log() -> None:
     ]
     assert at == ["NC", "NE", "ME", "SE", "SC", "SW", "MW", "NW", "NC", "MC", "SC", "MC", "MW", "MC", "ME"]
     assert (done.solution.count, done.solution.cost.places, done.solution.cost.paths) == (1, 9, 6)
+
+
+def test_where_a_building_has_rooms_its_doors_are_the_places(tmp_path: Path) -> None:
+    """A robot drives around four rooms in a ring."""
+    middles = {room: middle for room, middle in MIDDLES.items() if room != "closet"}
+    drive = record_plan(plan_of(tmp_path, xml(DOORS[:4], middles=middles)), seed=1, metres=50)
+    done = map_log(RobotLog(tuple(scans_of(drive)), source="ring"), maps=1, limit=60, with_ladder=False)
+    passed = [door for door, _ in itertools.groupby(crossing["door"] for crossing in drive.truth["crossings"])]
+    assert done.imported.scale.doors
+    assert len(done.imported.visits) == len(passed)
+    trace, (best, *_) = done.imported.trace, done.solution.maps
+    arrived = [t for t in range(len(trace)) if t == 0 or trace.actions[t - 1].kind == "travel"]
+    places = [best.dstates[best.labels[t]].place for t in arrived]
+    assert len(set(zip(passed, places, strict=True))) == len(set(passed)) == len(set(places))
+    no_doors = RobotLog(done.log.scans[: done.imported.visits[0].begin - 5], source="room")
+    with pytest.raises(LogError, match=r"expected a way through doors, .*--places junctions"):
+        import_log(no_doors, doors=True)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perception.errors import ImageWarning, LogError
+from perception.places.doors import find_doors, has_rooms, is_wide, visits_of
 from perception.places.scale import Scale, suggested
 from perception.places.tracing import to_trace
 from perception.places.track import Track, follow
@@ -47,11 +48,14 @@ class Imported:
     seconds: Mapping[str, float]
 
 
-def import_log(log: RobotLog, gateway: float | None = None, radius: float | None = None, name: str | None = None) -> Imported:
+def import_log(
+    log: RobotLog, gateway: float | None = None, radius: float | None = None, name: str | None = None, doors: bool | None = None
+) -> Imported:
     """The trace of a log. Corrected poses are truth for evaluation, and nothing here reads them for anything else.
 
     gateway, radius  metres, as in Scale; what the log itself suggests, where they are None
     name             of the trace
+    doors            whether the doors that the robot drives through are the places, rather than where ways part or bend; as the log itself suggests, where it is None
 
     Raises LogError where the robot passed no distinctive place, or hardly moved.
     """
@@ -62,9 +66,15 @@ def import_log(log: RobotLog, gateway: float | None = None, radius: float | None
         raise LogError(f"{named(log.source)}: expected a robot that drives, got a way of {track.way[-1]:.1f} m; take a longer log")
     with _timed(seconds, "scale"):
         found = suggested(log.scans, track)
-        scale = Scale(found.gateway if gateway is None else gateway, found.radius if radius is None else radius)
+        scale = replace(found, gateway=found.gateway if gateway is None else gateway, radius=found.radius if radius is None else radius)
     with _timed(seconds, "places"):
-        visits = find_visits(log, track, scale)
+        passed = find_doors(log, track) if (is_wide(scale) if doors is None else doors) else ()
+        scale = replace(scale, doors=bool(has_rooms(scale, passed, track) if doors is None else doors))
+        visits = visits_of(track, passed) if scale.doors else find_visits(log, track, scale)
+    if not visits and scale.doors:
+        raise LogError(
+            f"{named(log.source)}: expected a way through doors, got {track.way[-1]:.0f} m without any; look for junctions instead (--places junctions)"
+        )
     if not visits:
         raise LogError(
             f"{named(log.source)}: expected a way past junctions, corners or dead ends, got {track.way[-1]:.0f} m without any at a radius of "

@@ -28,12 +28,16 @@ RADII = 3.2
 class Scale:
     """What the distinctive places of a building are measured by, in metres.
 
-    gateway  the least width of a way out that counts as a gateway
-    radius   how far a way out must lead from the middle of a place
+    gateway   the least width of a way out that counts as a gateway
+    radius    how far a way out must lead from the middle of a place
+    corridor  how wide corridors are: most of the robot's way is at least so wide
+    doors     whether the places of the building are the doors between its rooms; if not, they are where ways part or bend
     """
 
     gateway: float
     radius: float
+    corridor: float = 0.0
+    doors: bool = False
 
     @property
     def doubtful(self) -> float:
@@ -62,7 +66,11 @@ def suggested(scans: Sequence[Scan], track: Track) -> Scale:
             left = np.array([-ahead[1], ahead[0]]) / length
             widths.append(_free_along(patch, track.poses[i, :2], left) + _free_along(patch, track.poses[i, :2], -left))
     narrow, corridor = np.percentile(widths, [NARROW, CORRIDOR]) if widths else (1.2, 1.7)
-    return Scale(gateway=round(float(np.clip(SHARE * narrow, 0.5, 2.0)), 2), radius=round(float(np.clip(RADII * corridor, 3.0, 8.0)), 2))
+    return Scale(
+        gateway=round(float(np.clip(SHARE * narrow, 0.5, 2.0)), 2),
+        radius=round(float(np.clip(RADII * corridor, 3.0, 8.0)), 2),
+        corridor=round(float(corridor), 2),
+    )
 
 
 def milestones(track: Track, every: float) -> list[int]:

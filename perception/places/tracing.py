@@ -27,6 +27,8 @@ RIGHT = 0.85
 AGREE = 0.2
 # How far the middle of a place and the direction of a way are off at one visit, by another: standard deviations in metres and radians.
 MIDDLE, DIRECTION = 0.4, 0.1
+# The same of the middle of a door.
+THRESHOLD = 0.1
 # Besides what matching scans says of itself, each displacement may be off by so much: standard deviations in metres and radians.
 FLOOR = (0.02, 0.02, 0.002)
 # What repeats in a track of matched scans: how far the scale of the odometer is off, as a share, and how the heading drifts, in radians a metre.
@@ -52,8 +54,9 @@ def has_right_angles(visits: Sequence[Visit]) -> bool:
 
 def to_trace(log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit], name: str | None = None) -> Trace:
     """The trace of a log: steps with images, stars and displacements, and the actions between them. Views are left to cluster."""
-    right = has_right_angles(visits)
-    visits = _aligned(visits, QUARTER if right else QUARTER / 2)
+    right = not scale.doors and has_right_angles(visits)
+    if not scale.doors:
+        visits = _aligned(visits, QUARTER if right else QUARTER / 2)
     maps = LocalMaps(log.scans, track, scale.window)
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
@@ -63,25 +66,33 @@ def to_trace(log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit],
         went = None if visit.left is None else visit.ways[visit.left].bearing
         # The only visit of a log that neither came from anywhere nor went on faces as the robot did.
         headings = [heading for heading in (came, went) if heading is not None] or [float(track.poses[visit.scan, 2])]
-        if len(headings) == 2 and apart(*headings) < AHEAD:
+        if len(headings) == 2 and apart(*headings) < AHEAD and not scale.doors:
             headings = headings[:1]
         for heading in headings:
             pose = (float(visit.middle[0]), float(visit.middle[1]), heading)
-            steps.append(_step(log, track, visit, pose, patch, last, right, number))
+            steps.append(_step(log, track, visit, pose, patch, last, right, scale.doors, number))
             last = (visit, pose)
         if steps and number < len(visits) - 1:
             steps[-1] = replace(steps[-1], action=Action.of("travel"))
-    steps = _with_turns(steps, right)
+    steps = _with_turns(steps, None if scale.doors else QUARTER if right else QUARTER / 2, visits)
     return Trace(
         tuple(steps),
         name=name,
-        odometry=Odometry(scale=SCALE, bend=DRIFT, offset=MIDDLE, facing=DIRECTION),
+        odometry=Odometry(scale=SCALE, bend=DRIFT, offset=THRESHOLD if scale.doors else MIDDLE, facing=DIRECTION),
         extra={"beams": {"first": -90, "step": 1}, "right_angles": right},
     )
 
 
 def _step(
-    log: RobotLog, track: Track, visit: Visit, pose: Pose, patch: Patch, last: tuple[Visit, Pose] | None, right: bool, number: int
+    log: RobotLog,
+    track: Track,
+    visit: Visit,
+    pose: Pose,
+    patch: Patch,
+    last: tuple[Visit, Pose] | None,
+    right: bool,
+    doors: bool,
+    number: int,
 ) -> Step:
     onward = covariance = None
     if last is not None:
@@ -98,7 +109,7 @@ def _step(
         truth = {"pose": [round(x, 4) for x in moved(scan.corrected, seen)]}
     return Step(
         image=tuple(round(float(r), 3) for r in _image(patch, visit.middle, pose[2])),
-        star=_star(visit, pose[2], right),
+        star=None if doors else _star(visit, pose[2], right),
         displacement=None if onward is None else (round(onward[0], 4), round(onward[1], 4), round(onward[2], 5)),
         covariance=covariance,
         truth=truth,
@@ -192,22 +203,33 @@ def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> 
     return tuple(tuple(round(float(v), 8) for v in row) for row in found)  # type: ignore[return-value]
 
 
-def _with_turns(steps: list[Step], right: bool) -> list[Step]:
-    """The steps with the turns between two of one visit."""
+def _with_turns(steps: list[Step], stride: float | None, visits: Sequence[Visit]) -> list[Step]:
+    """The steps with the turns between two of one visit: to the nearest multiple of a stride, or, where that is None, by any angle."""
     done = list(steps)
     for i, step in enumerate(steps[:-1]):
         if step.action is None:
             turned = steps[i + 1].displacement
             assert turned is not None
-            done[i] = replace(step, action=_turn(-math.degrees(turned[2]), right))
+            visit = visits[int(step.extra["visit"])]
+            clockwise = -math.degrees(turned[2])
+            done[i] = replace(
+                step, action=_any_turn(clockwise, visit.arrived == visit.left) if stride is None else _turn(clockwise, stride)
+            )
     return done
 
 
-def _turn(degrees: float, right: bool) -> Action:
-    """A turn by degrees, clockwise: to the nearest quarter, or eighth, of a full turn."""
-    stride = 90 if right else 45
-    rounded = round(degrees / stride) * stride % 360
+def _turn(clockwise: float, stride: float) -> Action:
+    """A turn by degrees to the nearest multiple of a stride, in radians."""
+    rounded = round(clockwise / math.degrees(stride)) * round(math.degrees(stride)) % 360
     names = {90: "right", 180: "around", 270: "left"}
     if rounded in names:
         return Action.of(names[rounded])
     return Action(f"turn {rounded}", "turn", "right" if rounded < 180 else "left", bearing=float(rounded))
+
+
+def _any_turn(clockwise: float, back: bool) -> Action:
+    """A turn by degrees towards another door: around if it leads back to where the robot came from, else to another path, however little it turns."""
+    if back:
+        return Action.of("around")
+    degrees = round(clockwise % 360, 1)
+    return Action(f"turn {degrees:g}", "turn", "right" if degrees < 180 else "left")

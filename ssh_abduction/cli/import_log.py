@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 # Those of perception.readers.logs, which would take long to load before it is known what is asked.
 FORMATS = ("carmen", "g2o", "ros1", "ros2", "mcap")
+PLACES = ("junctions", "doors")
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -40,6 +41,11 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         "scale", "which ways out of a place count; the log itself suggests it by the passages that the robot drove through"
     )
     scale.add_argument("--gateway", type=metres, metavar="M", help="the least width of a gateway, in metres")
+    scale.add_argument(
+        "--places",
+        choices=PLACES,
+        help="what the places are: where ways part or bend (junctions), or the doors between rooms (doors) (default: doors in a building that has rooms and no corridors)",
+    )
     scale.add_argument("--radius", type=metres, metavar="M", help="how far a way out must lead from the middle of a place, in metres")
 
 
@@ -71,13 +77,19 @@ def run(options: argparse.Namespace) -> int:
         raise SSHError(f"{named(options.output)}: cannot write the trace: its folder is not there; make it first")
     log = read(options.log, options)
     warn([*log.notes, *damage(log)])
-    done = import_log(log, options.gateway, options.radius, named_after(options.log))
-    said = (
-        f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: {counted(len(done.visits), 'visits')} to distinctive places at a radius of {done.scale.radius:g} m, "
-        f"gateways from {done.scale.gateway:g} m; {counted(len(done.trace), 'steps')}"
-    )
+    done = import_log(log, options.gateway, options.radius, named_after(options.log), doors_of(options))
+    scale = done.scale
+    places = "doors" if scale.doors else f"distinctive places at a radius of {scale.radius:g} m, gateways from {scale.gateway:g} m"
+    said = f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: {counted(len(done.visits), 'visits')} to {places}; {counted(len(done.trace), 'steps')}"
     write(done.trace, options.output, said)
     return 0
+
+
+def doors_of(options: argparse.Namespace) -> bool | None:
+    """Whether doors are the places, as asked; None where the log is to tell. A scale that is given is one of junctions."""
+    if options.places is None and (options.gateway or options.radius):
+        return False
+    return None if options.places is None else bool(options.places == "doors")
 
 
 def named_after(path: str) -> str:

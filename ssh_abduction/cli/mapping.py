@@ -20,7 +20,7 @@ from typing import Any
 
 from ssh_abduction.asp.limits import check_limit
 from ssh_abduction.cli import EXIT_ERROR, batch, workers
-from ssh_abduction.cli.import_log import damage, named_after
+from ssh_abduction.cli.import_log import damage, doors_of, named_after
 from ssh_abduction.cli.options import choices_of, theory_of
 from ssh_abduction.cli.outcome import exit_code, interrupted_code, warn
 from ssh_abduction.cli.text import counted
@@ -52,6 +52,7 @@ class MapQuestion:
     reading: tuple[str | None, str | None, str | None]
     gateway: float | None
     radius: float | None
+    doors: bool | None
     limit: float | None
     maps: int
     ladder: bool
@@ -67,6 +68,7 @@ class MapQuestion:
             "reading": list(self.reading),
             "gateway": self.gateway,
             "radius": self.radius,
+            "doors": self.doors,
             "limit": self.limit,
             "maps": self.maps,
             "ladder": self.ladder,
@@ -107,6 +109,7 @@ class MapQuestion:
             choices=self.choices,
             gateway=self.gateway,
             radius=self.radius,
+            doors=self.doors,
             name=named_after(path),
             limit=self.limit,
             maps=self.maps,
@@ -159,6 +162,7 @@ def run(options: argparse.Namespace) -> int:
         (options.format, options.scan_topic, options.odom_topic),
         options.gateway,
         options.radius,
+        doors_of(options),
         options.time_limit,
         options.maps,
         not options.no_ladder,

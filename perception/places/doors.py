@@ -1,0 +1,131 @@
+"""The doors that a robot drives through, where they are the places of a building.
+
+In a building of rooms the robot crosses wide spaces as it likes, and no way bends or parts where it must. What it cannot avoid there are doors: constrictions of the free space that its way leads
+through. So a place is a door, and a path leads across a room from one door to the next.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from perception.places.local_map import CELL, Bools, LocalMaps, Patch
+from perception.places.scale import Scale
+from perception.places.track import Array, Track
+from perception.places.visits import Visit, Way
+from perception.readers.scans import RobotLog
+
+# The way is looked at once in so many metres: a door may be no deeper than a wall. A local map is good for so many of these looks.
+STRIDE, LOOKS = 0.1, 5
+# Widths are measured across the way, and askew to either side by up to this, in radians: the robot need not go straight through.
+ASKEW = np.radians(np.arange(-50.0, 51.0, 10.0))
+# And no farther to either side than this, in metres.
+ASIDE = 3.0
+# A door is at most so wide, in metres, and the way is wider by such a share within so many metres before and after it.
+DOOR, WIDER, BESIDE = 1.6, 1.33, 2.0
+# Two doors are at least so many metres of the way apart.
+DEEP = 1.0
+# A building is one of rooms if its corridors would be wider than this, in metres, and the robot drives through a door at least once in so many metres.
+WIDE, OFTEN = 2.5, 20.0
+# Two doors are one if their middles are nearer than this, in metres.
+SAME = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class Door:
+    """A door that the robot drove through.
+
+    scan    the first scan behind it
+    middle  (x, y) in metres, in the frame of the track
+    width   in metres
+    way     metres of the robot's way up to it
+    """
+
+    scan: int
+    middle: Array
+    width: float
+    way: float
+
+
+def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
+    """The doors that the robot drove through, in order, once for each time."""
+    maps = LocalMaps(log.scans, track, 2 * ASIDE)
+    ways = np.arange(0.0, track.way[-1], STRIDE)
+    moving = np.concatenate([[True], np.diff(track.way) > 0])
+    positions = np.stack([np.interp(ways, track.way[moving], track.poses[moving, k]) for k in (0, 1)], axis=1)
+    scans = np.searchsorted(track.way, ways, side="right") - 1
+    ahead = positions[np.minimum(np.arange(len(ways)) + 3, len(ways) - 1)] - positions[np.maximum(np.arange(len(ways)) - 3, 0)]
+    across = np.arctan2(ahead[:, 1], ahead[:, 0]) + math.pi / 2
+    gaps: list[tuple[float, Array]] = []
+    for begin in range(0, len(ways), LOOKS):
+        some = slice(begin, begin + LOOKS)
+        middle = begin + len(positions[some]) // 2
+        patch = maps.around(int(scans[middle]), positions[middle], ASIDE + 1)
+        occupied = ndimage.binary_dilation(patch.occupied, np.ones((2, 2), bool))
+        gaps += [_gap(occupied, patch, at, angle) for at, angle in zip(positions[some], across[some], strict=True)]
+    widths = np.array([width for width, _ in gaps])
+    found: list[Door] = []
+    for k in np.argsort(widths, kind="stable"):
+        if widths[k] > DOOR:
+            break
+        before, after = widths[(ways < ways[k]) & (ways >= ways[k] - BESIDE)], widths[(ways > ways[k]) & (ways <= ways[k] + BESIDE)]
+        if not len(before) or not len(after) or min(before.max(), after.max()) < WIDER * widths[k]:
+            continue
+        if all(abs(door.way - ways[k]) > DEEP for door in found):
+            found.append(Door(int(np.searchsorted(track.way, ways[k], side="right")), gaps[k][1], float(widths[k]), float(ways[k])))
+    return tuple(sorted(found, key=lambda door: door.way))
+
+
+def _gap(occupied: Bools, patch: Patch, at: Array, across: float) -> tuple[float, Array]:
+    """The least width of the free space across a way, in metres, and the middle of that."""
+    far = np.arange(0.0, ASIDE, CELL / 2)
+    directions = np.stack([np.cos(across + ASKEW), np.sin(across + ASKEW)], axis=1)
+    sides = np.stack([directions, -directions], axis=1)
+    cells = np.rint((at + far[:, None] * sides[:, :, None, :] - patch.corner) / CELL).astype(int)
+    hit = occupied[cells[..., 0], cells[..., 1]]
+    free = np.where(hit.any(axis=2), far[hit.argmax(axis=2)], ASIDE)
+    k = int(free.sum(axis=1).argmin())
+    return float(free[k].sum()), at + (free[k, 0] - free[k, 1]) / 2 * directions[k]
+
+
+def is_wide(scale: Scale) -> bool:
+    """Whether most of the building is wider than corridors are, so that it may be one of rooms."""
+    return scale.corridor > WIDE
+
+
+def has_rooms(scale: Scale, doors: Sequence[Door], track: Track) -> bool:
+    """Whether the building is one of rooms, and not of corridors: most of it is wide, and the robot drives through doors again and again."""
+    return is_wide(scale) and len(doors) * OFTEN > track.way[-1]
+
+
+def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
+    """The visits to doors, in order: one where the robot went into a room and came back by the same door. Corrected poses are not read."""
+    passes: list[list[Door]] = []
+    for door in doors:
+        if passes and math.dist(door.middle, passes[-1][-1].middle) < SAME:
+            passes[-1].append(door)
+        else:
+            passes.append([door])
+    middles = [np.mean([door.middle for door in same], axis=0) for same in passes]
+    return tuple(_visit(track, passes, middles, number) for number in range(len(passes)))
+
+
+def _visit(track: Track, passes: Sequence[Sequence[Door]], middles: Sequence[Array], number: int) -> Visit:
+    """The visit to a door, whose ways out are the straight ways to the doors before and after it."""
+    same, middle = passes[number], middles[number]
+    came = _bearing(middle, middles[number - 1]) if number > 0 else None
+    went = _bearing(middle, middles[number + 1]) if number < len(passes) - 1 else None
+    if came is not None and went is not None and math.dist(middles[number - 1], middles[number + 1]) < SAME:
+        went = came
+    ways = sorted({bearing for bearing in (came, went) if bearing is not None})
+    arrived, left = (None if bearing is None else ways.index(bearing) for bearing in (came, went))
+    end = min(same[-1].scan, len(track.poses) - 1)
+    return Visit(min(same[0].scan, end), middle, max(same[0].scan - 1, 0), end, tuple(map(Way, ways)), arrived, left)
+
+
+def _bearing(start: Array, end: Array) -> float:
+    return math.atan2(end[1] - start[1], end[0] - start[0])
