@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
@@ -22,8 +23,9 @@ from distributed import LocalCluster
 from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Speedups, Theory, Trace
-from ssh_abduction.cli import batch, main
+from ssh_abduction.cli import batch, main, mapping, workers
 from ssh_abduction.cli.batch import Answer, Question, Stop
+from ssh_abduction.cli.mapping import MapAnswer, MapQuestion
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ENDLESS = ["--boundary", "none", "--path-order", "partial", "--prefer", "", "-n", "0"]  # a theory in which slow.jsonl has maps without end
@@ -38,6 +40,19 @@ class Deadly(Question):
             time.sleep(0.3)  # others shall be under way
             os.kill(os.getpid(), signal.SIGKILL)
         return Question.answer(self, number, path, *rest)
+
+
+class KilledOnce(MapQuestion):
+    """Writes down that it maps a log. The first time that it maps one of this name, the worker is killed whose process does so."""
+
+    def answer(self, number: int, path: str, *rest: Any) -> MapAnswer:
+        assert workers.serves()  # so the process that began this one is the worker
+        begun = Path(path).with_suffix(".begun")
+        with begun.open("a") as file:
+            file.write("begun\n")
+        if "deadly" in path and begun.read_text().count("begun") == 1:
+            os.kill(os.getppid(), signal.SIGKILL)
+        return MapQuestion.answer(self, number, path, *rest)
 
 
 @pytest.fixture
@@ -180,6 +195,21 @@ def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler:
         assert sorted(lines) == [*range(len(paths))]
         for number, path in enumerate(paths):
             assert lines[number].startswith(f"{path}: {'error: process: expected' if 'deadly' in path else 'optimal'}")
+
+
+def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
+    tmp_path: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quick, deadly = str(tmp_path / "quick.log"), str(tmp_path / "deadly.log")
+    monkeypatch.setattr(mapping, "MapQuestion", KilledOnce)
+    assert main(["simulate", "notched-rectangle", "--as", "carmen", "--every", "0.5", "-q", "-o", quick]) == 0
+    shutil.copy(quick, deadly)
+    command = ["map", quick, deadly, "-o", str(tmp_path / "runs"), "--no-ladder", "--scheduler", scheduler, "--jobs", "1"]
+    capsys.readouterr()
+    for said in ("1 place", "done already"):
+        assert main(command) == 0
+        assert [line.partition(",")[0] for line in capsys.readouterr().out.splitlines()] == [f"{quick}: {said}", f"{deadly}: {said}"]
+    assert {path.name: path.read_text().count("begun") for path in tmp_path.glob("*.begun")} == {"quick.begun": 1, "deadly.begun": 2}
 
 
 def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler: str) -> None:

@@ -14,24 +14,22 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
+import aces
 import networkx as nx
 import pytest
+from aces import ACES
 from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.theory import encodings
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
-ACES = str(EXAMPLES / "aces3-route.jsonl")
-
 
 @pytest.fixture
-def solved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+def solved(tmp_path: Path) -> Path:
     """The minimal maps of the ACES3 route, as solve --json prints them."""
-    assert main(["solve", ACES, "--json"]) == 0
     path = tmp_path / "maps.json"
-    path.write_text(capsys.readouterr().out)
+    path.write_text(aces.answer())
     return path
 
 
@@ -75,7 +73,7 @@ def test_all_maps_and_a_few(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         assert (data["count"], len(data["maps"]), data["complete"]) == (count, count, complete)
 
 
-def test_every_field_of_a_theory_is_a_flag(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_field_of_a_theory_is_a_flag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flags = [
         *(
             "--theory",
@@ -91,7 +89,8 @@ def test_every_field_of_a_theory_is_a_flag(capsys: pytest.CaptureFixture[str]) -
         *("--no-all-on-paths", "--star", "pattern", "--prefer", "places,excuses", "--without", "on_path", "--level", "topological"),
         *("--displacement", "none", "--reject", "0.01", "--joint", "1"),
     ]
-    assert main(["solve", ACES, "-n", "1", "--json", *flags]) == 0
+    route = saved(drive(*TOURS["square"], stars=True), tmp_path)
+    assert main(["solve", route, "-n", "1", "--json", *flags]) == 0
     expected = Theory(
         boundary="defeasible",
         symmetric_sides=False,

@@ -8,13 +8,13 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from worlds import HEADINGS, PLUS, TEE, Streets, streets
+from worlds import HEADINGS, TEE, Streets, streets
 
 from ssh_abduction import Action, Exploration, Explorer, Status, Step, Theory, TheoryError, TraceError, solve
 from ssh_abduction.errors import SSHError
 
 TURNS = {"right": 1, "around": 2, "left": 3}
-CORRIDOR = streets(("a", "E", "b"), ("b", "E", "c"), ("c", "E", "d"))
+CORRIDOR = streets(("a", "E", "b"), ("b", "E", "c"))
 RING = streets(("a", "E", "b"), ("b", "E", "c"), ("a", "S", "d"), ("d", "E", "e"), ("e", "E", "f"), ("c", "S", "f"))
 
 
@@ -71,8 +71,8 @@ def partition(names: Collection[Any]) -> list[int]:
 
 @pytest.mark.parametrize(
     ("world", "start", "margin"),
-    [(CORRIDOR, "a", 1), (TEE, "W", 1), (PLUS, "W", 0), (RING, "a", 0)],
-    ids=["corridor", "tee", "plus", "ring"],
+    [(CORRIDOR, "a", 1), (TEE, "W", 0), (RING, "a", 0)],
+    ids=["corridor", "tee", "ring"],
 )
 def test_streets_are_known_when_it_is_done(world: Streets, start: str, margin: int) -> None:
     robot = Streetwalker(world, start, "E")
@@ -161,7 +161,7 @@ def test_no_map_is_said() -> None:
 
 
 def test_a_step_goes_on_where_exploring_was_left() -> None:
-    whole, parts = (Explorer(Streetwalker(TEE, "W", "E"), margin=0) for _ in range(2))
+    whole, parts = (Explorer(Streetwalker(CORRIDOR, "a", "E"), margin=0) for _ in range(2))
     whole.explore(100)
     while parts.explore(1).ending == "steps":
         pass

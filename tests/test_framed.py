@@ -97,7 +97,7 @@ def plainly_charted(engine: FramedEngine, size: int, before: FramedChart | None 
     return Chart.framed(engine._task.trace, engine._task.log, size)
 
 
-@settings(max_examples=45, derandomize=True)
+@settings(max_examples=24)
 @given(framed_traces(), framed_theories(), st.sets(st.sampled_from(SPEEDUPS)), st.data())
 def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off: set[str], data: st.DataObject) -> None:
     """With prefixes, cores and what is told in one go so small that all of it happens on short traces; and with any speed-ups off."""
@@ -149,7 +149,7 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         assert check(trace, ssh_map, theory) == ()
 
 
-@settings(max_examples=40, derandomize=True)
+@settings(max_examples=20)
 @given(framed_traces(), framed_theories(), st.integers(0, 20))
 def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: Theory, sweeps: int) -> None:
     """From a guess of any quality. Names that do not fit a frame, or have no paths, are no maps; and clingo may need more names than it had."""
@@ -211,7 +211,7 @@ def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, 
     assert found.count == len(set(found.maps))
 
 
-@settings(max_examples=15, derandomize=True)
+@settings(max_examples=8)
 @given(framed_traces(), framed_theories(), st.data())
 def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, data: st.DataObject) -> None:
     """Whether clingo is told what is new, or all of it anew."""
@@ -544,7 +544,7 @@ def places(walk: Walk, chart: FramedChart) -> list[object]:
     return list(place.values())
 
 
-@settings(max_examples=100, derandomize=True)
+@settings(max_examples=100)
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3)), min_size=2, max_size=7), st.data())
 def test_what_fails_to_be_transitive_is_among_the_scattered(states: list[tuple[int, int]], data: st.DataObject) -> None:
     """Visits at places, but for some pairs that are left out, turned otherwise, or added."""
@@ -572,7 +572,7 @@ def test_annealing_finds_the_places_of_a_maze(seed: int) -> None:
     assert len(set(zip(guessed, places(walk, chart), strict=True))) == len(set(guessed)) == len(set(places(walk, chart)))
 
 
-@settings(max_examples=60, derandomize=True)
+@settings(max_examples=30)
 @given(framed_traces(), st.integers(1, 20))
 def test_a_guess_holds_the_stars(trace: Trace, sweeps: int) -> None:
     """Also one that is not sure: visits of a place have the same star in its frame."""
@@ -609,7 +609,7 @@ def node_labels(ssh_map: SSHMap, chart: FramedChart) -> list[int]:
     return [ssh_map.labels[chart.node_of.index(node)] for node in range(len(chart.seen))]
 
 
-@settings(max_examples=30, derandomize=True)
+@settings(max_examples=15)
 @given(framed_traces(), framed_theories(), st.data())
 def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: Theory, data: st.DataObject) -> None:
     """So merging by evidence may keep to it."""
@@ -627,7 +627,7 @@ def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: T
         assert all(labels[a] == labels[b] for a, b in one)
 
 
-@settings(max_examples=40, derandomize=True)
+@settings(max_examples=20)
 @given(framed_traces(), framed_theories(), st.lists(st.integers(-1, 4), min_size=9, max_size=9), st.booleans())
 def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[int], told: bool) -> None:
     """Of the causal axioms; and where separate paths fit it, others do."""

@@ -141,7 +141,7 @@ gateways = st.builds(
 )
 
 
-@settings(max_examples=70, derandomize=True)
+@settings(max_examples=40)
 @given(gateways, gateways, st.integers(0, 3))
 def test_rotations_are_those_of_a_plain_search(first: Frame, then: Frame, shift: int) -> None:
     if first.slots != then.slots:
@@ -203,7 +203,7 @@ def traces(draw: st.DrawFn) -> Trace:
     return Trace.from_steps(views, actions, stars=stars)
 
 
-@settings(max_examples=30, derandomize=True)
+@settings(max_examples=15)
 @given(traces(), st.data())
 def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.DataObject) -> None:
     theory = GATEWAYS.replace(
@@ -223,7 +223,7 @@ def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.Da
     assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
 
 
-@settings(max_examples=30, derandomize=True)
+@settings(max_examples=15)
 @given(traces(), st.data())
 def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
     """star=alike: solver and checker against the brute force, which tries all ways to pair gateways; the maps of the bare causal theory are judged by it, too."""
@@ -238,7 +238,7 @@ def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
         assert (check(trace, ssh_map, theory) == ()) == (key(ssh_map) in allowed)
 
 
-@settings(max_examples=30, derandomize=True)
+@settings(max_examples=15)
 @given(traces(), st.sampled_from(LEFT_OUT[:5]))
 def test_checker_rejects_what_the_brute_force_does_not_find(trace: Trace, left_out: str) -> None:
     """The maps of a theory that lacks an axiom, under the axioms that have it."""
@@ -335,7 +335,7 @@ def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> N
     assert solution.cost.places == tour.places
 
 
-@pytest.mark.parametrize(("spokes", "noise", "unseen"), [(5, 0, False), (6, 0, False), (5, 9, True), (6, 9, True)])
+@pytest.mark.parametrize(("spokes", "noise", "unseen"), [(5, 0, False), (6, 9, True)])
 def test_no_axiom_forbids_the_true_map(spokes: int, noise: float, unseen: bool) -> None:
     """Hubs with a ring road: bearings may be off by less than their spread, and gateways behind the robot need not be observed."""
     tour = drive(planar.wheel(spokes), "hub", 0, 24, random.Random(spokes), noise=noise, unseen=unseen)

@@ -41,7 +41,7 @@ def small_traces(draw: st.DrawFn) -> Trace:
     return Trace.from_steps(draw(st.lists(st.sampled_from("aab"), min_size=steps, max_size=steps)), done, displacements=moves)
 
 
-@settings(max_examples=15, derandomize=True)
+@settings(max_examples=8)
 @given(small_traces(), st.booleans(), st.sampled_from([0.4, 1.0, 1.7]))
 def test_minimal_maps_are_the_best_of_all_ways_to_leave_displacements_out(trace: Trace, causal: bool, price: float) -> None:
     if not trace.has_displacements:
@@ -98,8 +98,8 @@ def test_the_checker_believes_what_the_map_believes() -> None:
 @pytest.mark.parametrize(("seed", "jumps"), [(11, 1), (12, 2)])
 def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_truth(seed: int, jumps: int) -> None:
     chance = random.Random(seed)
-    walk = maze(3, 3, steps=120, seed=seed, stars=True, follow=True, odometry=NOISE)
-    wrong = sorted(chance.sample(range(25, 100), jumps))
+    walk = maze(3, 3, steps=60, seed=seed, stars=True, follow=True, odometry=NOISE)
+    wrong = sorted(chance.sample(range(20, 45), jumps))
     steps = list(walk.trace.steps)
     for t in wrong:
         steps[t] = replace(
@@ -107,7 +107,7 @@ def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_t
         )
     trace = replace(walk.trace, steps=tuple(steps))
     true = len(set(walk.truth))
-    solution = solve(trace, jumped=3, limit=20)
+    solution = solve(trace, jumped=3, limit=100)
     assert solution.cost is not None
     assert solution.cost.dstates + solution.cost.faults <= true + 3 * jumps
     assert check(trace, solution.maps[0], solution.theory) == ()

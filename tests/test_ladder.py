@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,10 @@ from ssh_abduction import Odometry, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.rungs import ladder
 
+SQUARE = Trace.from_steps("ab" * 4 + "a", ["travel", "right"] * 4, displacements=[(10, 0, 0), (0, 0, -1.5708)] * 4)
 
+
+@cache
 def aces3() -> truth.Known:
     (known,) = truth.aces3([3], truth.Noise(Odometry(**truth.NOISE)))
     return known
@@ -28,17 +32,15 @@ def test_displacements_make_the_true_map_of_aces3_the_only_minimal_one() -> None
 
 
 def test_what_a_trace_does_not_have_is_no_rung() -> None:
-    trace = aces3().trace
+    trace = aces3().trace.prefix(8)
     assert [rung.name for rung in ladder(trace.without_displacements(), maps=1)] == ["views", "+ star", "+ planarity"]
     causal = {rung.name: rung.solution.theory.star for rung in ladder(trace, Theory.causal(), maps=1)}
     assert causal == {"views": "none", "+ star": "alike", "+ pairs": "alike", "+ geometry": "alike"}  # planarity is about places
 
 
 def test_what_is_solved_already_is_its_rung() -> None:
-    square = [(10, 0, 0), (0, 0, -1.5708)] * 4
-    trace = Trace.from_steps("ab" * 4 + "a", ["travel", "right"] * 4, displacements=square)
-    known = solve(trace)
-    assert [rung.name for rung in ladder(trace, known=known) if rung.solution is known] == ["+ geometry"]
+    known = solve(SQUARE)
+    assert [rung.name for rung in ladder(SQUARE, known=known) if rung.solution is known] == ["+ geometry"]
 
 
 def test_where_faults_are_allowed_planarity_is_no_rung() -> None:
@@ -54,5 +56,6 @@ def test_the_shell_prints_a_row_a_rung(tmp_path: Path, capsys: pytest.CaptureFix
     assert head.split()[:2] == ["minimal", "maps"]
     assert rows[1].split()[:7] == ["+", "star", "4", "19", "10", "4", "none"]
     assert rows[3].split()[:8] == ["+", "geometry", "1", "22", "9", "6", "map", "1"]
+    SQUARE.save(path)
     assert main(["ladder", str(path), "--json", "--theory", "causal", "-n", "1"]) == 0
-    assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == ["views", "+ star", "+ pairs", "+ geometry"]
+    assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == ["views", "+ pairs", "+ geometry"]

@@ -60,7 +60,7 @@ def test_what_a_true_map_of_some_visits_says_of_the_others_is_true(seed: int) ->
     assert len(told) < 0.8 * len(states)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> None:
     """What it takes for the states of all visits is a map; and what it misses, with what led there, no state of it explains."""
     walk = maze(3, 3, steps=400, seed=seed, stars=True)
@@ -85,7 +85,7 @@ def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> N
             assert {visit: found.states[visit] for visit in at} == at
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_long_trace_is_solved_from_few_of_its_visits(seed: int) -> None:
     """All its minimal maps, as when clingo is told of all visits."""
     trace = maze(3, 3, steps=800, seed=seed, stars=True).trace
@@ -102,10 +102,10 @@ def test_a_long_trace_is_solved_from_few_of_its_visits(seed: int) -> None:
     assert check(trace, maps[0], search.theory) == ()
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_beginning_of_a_long_trace_is_guessed(seed: int) -> None:
+@pytest.mark.parametrize(("seed", "steps", "guesses"), [(1, 700, 1), (3, 700, 2), (3, 500, 2)])
+def test_the_beginning_of_a_long_trace_is_guessed(seed: int, steps: int, guesses: int) -> None:
     """And the rest follows from it, or twice as many visits are guessed, until all are. Either way it is a map with paths."""
-    walk = maze(3, 3, steps=700, seed=seed, stars=True)
+    walk = maze(3, 3, steps=steps, seed=seed, stars=True)
     chart = charted(walk)
     guessed: list[int] = []
     begun = Paths._guessed
@@ -119,6 +119,7 @@ def test_the_beginning_of_a_long_trace_is_guessed(seed: int) -> None:
     with fewer_sweeps, patch.object(paths_module, "FIRST_PAIRS", 300), patch.object(Paths, "_guessed", counted):
         found = asked.guessed_labels(chart, Watch())
     assert guessed[0] < len(chart.stars) / 2
+    assert len(guessed) == guesses
     assert all(later in {2 * earlier, len(chart.stars)} for earlier, later in pairwise(guessed))
     assert chart.is_map(found)
     assert asked.has_separate(chart, found)

@@ -66,7 +66,7 @@ def agree(trace: Trace, theory: Theory) -> None:
             assert getattr(answer.cost, name) == getattr(anew.cost, name)
 
 
-@settings(max_examples=14, derandomize=True)
+@settings(max_examples=8)
 @given(st.data())
 def test_after_every_step_the_answer_is_that_of_solving_anew(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=9), label="trace")
@@ -78,7 +78,7 @@ def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
     agree(Trace.from_steps("abaabb", ["travel", "around", "travel", "right", "travel"]), Theory(without=(name,)))
 
 
-@settings(max_examples=12, derandomize=True)
+@settings(max_examples=8)
 @given(st.data())
 def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
@@ -105,8 +105,8 @@ def test_a_bound_is_known_where_more_maps_of_a_known_cost_are_asked_for() -> Non
 
 @pytest.mark.parametrize("theory", [Theory.causal(), Theory.topological(), Theory.circumscriptive()], ids=["causal", "dstates", "paths"])
 def test_circuits_are_replayed(theory: Theory) -> None:
-    mapper, answers = follow(rectangle(2000), theory)
-    assert answers[-1].maps == solve(rectangle(2000), theory).maps
+    mapper, answers = follow(rectangle(800), theory)
+    assert answers[-1].maps == solve(rectangle(800), theory).maps
     assert all(a.status is Status.OPTIMAL and a.complete for a in answers)
     assert mapper.searches < 12
     assert mapper.solution.prefix < 16
@@ -127,7 +127,7 @@ def test_a_mapper_says_how_far_it_is() -> None:
     assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
 
 
-@settings(max_examples=100, derandomize=True)
+@settings(max_examples=50)
 @given(st.data())
 def test_sketches_are_consistent(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=14), label="trace").without_displacements()  # what evidence says, a sketch does not know
@@ -161,7 +161,7 @@ def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
     return doubts
 
 
-@settings(max_examples=50, derandomize=True)
+@settings(max_examples=25)
 @given(st.data())
 def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=10), label="trace").without_displacements()  # what evidence says, a sketch does not know
@@ -172,14 +172,14 @@ def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> 
 @pytest.mark.parametrize("stars", [False, True])
 def test_a_map_goes_on_through_a_maze(stars: bool) -> None:
     doubts: list[bool] = []
-    for seed in range(8):
+    for seed in range(5):
         trace = maze(3, 3, steps=90, seed=seed, loops=0.5, stars=True).trace
         trace = trace if stars else Trace.from_steps([step.view or "" for step in trace], trace.actions)
         doubts += draft(trace, Theory.topological().resolve(trace), 12 + 4 * seed if stars else 6 + seed, seed)
     assert {*doubts} == {True, False}
 
 
-@settings(max_examples=15, derandomize=True)
+@settings(max_examples=8)
 @given(st.data())
 def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=9), label="trace")
@@ -200,7 +200,7 @@ def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) ->
 
 def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
     """The tour is solved for its first half; then there is no time."""
-    trace = drive(*TOURS["comb"])
+    trace = drive(*TOURS["plus"])
     theory = Theory.topological().resolve(trace)
     half = len(trace) // 2
     mapper, _ = follow(trace.prefix(half), theory)
@@ -359,7 +359,7 @@ def test_a_displacement_that_is_none_changes_nothing(given: dict[str, Any], mess
 
 
 @pytest.mark.parametrize(
-    ("theory", "stars", "steps"), [(Theory(), True, 30), (Theory(), False, 16), (Theory.causal(), False, 24), (Theory(joint=1), True, 24)]
+    ("theory", "stars", "steps"), [(Theory(), True, 24), (Theory(), False, 16), (Theory.causal(), False, 24), (Theory(joint=1), True, 16)]
 )
 def test_the_trace_settles_displacements_as_it_grows(theory: Theory, stars: bool, steps: int) -> None:
     """The first displacement comes late, and one is missing; the number of returns that may be true doubles several times."""
@@ -433,6 +433,6 @@ def test_the_first_step_settles_the_stars() -> None:
 
 
 def test_the_same_steps_give_the_same_answers() -> None:
-    trace = drive(*TOURS["comb"], stars=False)
+    trace = drive(*TOURS["plus"], stars=False)
     first, second = ([(a.maps, a.cost, a.prefix) for a in follow(trace, Theory())[1]] for _ in range(2))
     assert first == second

@@ -294,11 +294,17 @@ sys.meta_path.insert(0, Interrupting())
 """
 
 
+SCRIPT = "-c import~sys;from~ssh_abduction.__main__~import~run;sys.exit(run())"
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 @pytest.mark.parametrize(
-    "module", ["ssh_abduction.cli", "argparse", "clingo", "ssh_abduction.cli.train", "numpy", "numpy.linalg", "sklearn.base"]
+    ("program", "module"),
+    [
+        *(("-m ssh_abduction", module) for module in ("ssh_abduction.cli", "argparse", "clingo", "numpy.linalg", "sklearn.base")),
+        *((SCRIPT, module) for module in ("ssh_abduction.cli", "ssh_abduction.cli.train", "numpy")),
+    ],
 )
-@pytest.mark.parametrize("program", ["-m ssh_abduction", "-c import~sys;from~ssh_abduction.__main__~import~run;sys.exit(run())"])
 def test_ctrl_c_while_modules_load_is_quiet(program: str, module: str, tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(CTRL_C_AT.format(module=module))
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -216,7 +216,7 @@ def loose(data: st.DataObject, trace: Trace) -> Theory:
     )
 
 
-@settings(max_examples=25, derandomize=True)
+@settings(max_examples=12)
 @given(data=st.data())
 def test_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(winding(), label="trace")
@@ -273,7 +273,7 @@ def test_a_map_cut_to_first_steps_stays_planar() -> None:
                 assert Planar.of(theory).refuse(trace, SSHMap(labels, ssh_map.dstates, ())) is None
 
 
-@settings(max_examples=8, derandomize=True)
+@settings(max_examples=5)
 @given(data=st.data())
 def test_while_a_robot_drives_maps_are_those_of_solve(data: st.DataObject) -> None:
     trace = data.draw(winding(), label="trace")
