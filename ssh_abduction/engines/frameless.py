@@ -34,16 +34,22 @@ from ssh_abduction.engines.naming import NamedLabels
 from ssh_abduction.engines.paths import PREPARING
 from ssh_abduction.engines.refusing import all_accepted
 from ssh_abduction.engines.visits import smaller
+from ssh_abduction.maps import SSHMap
 from ssh_abduction.steps.chart import Link, numbered
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 
 # Clingo is told of so many paths, or of so many pairs of dstates, in one go: of fewer it would be asked more often, and most of more would not be needed.
 CONTRARY = 8
+# So many maps whose places differ come first, or some more: they are remembered while the others are listed.
+SOONER = 1000
 # After so many conflicts better paths are no longer sought one after another; the bound is raised from below instead.
 BETTERING = 20_000
 
-_Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...]]  # labels of all steps, and options of clasp
+# Labels of all steps, options of clasp, and the parts of the program.
+_Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...], tuple[str, ...]]
+# The parts of the program that say which places and paths fit labels; and that answers are listed, too, which differ in paths alone.
+PARTS, EACH = ("base", "least", "paths"), ("each",)
 
 
 @dataclass(frozen=True)
@@ -155,7 +161,17 @@ class FramelessEngine:
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         every = self._best[1] if self._best and self._best[0] == cost else self._all_that_fit(cost[0])
         mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
-        yield from islice((found for labels in every for found in self._fitting.maps(labels, mode)), enough or None)
+        yield from islice(self._listed(every, mode), enough or None)
+
+    def _listed(self, every: Iterable[list[int]], mode: str) -> Iterator[Found]:
+        """The maps with these labels. Where displacements are used, maps whose places differ come first: how well maps close depends on dstates and places alone."""
+        left, sooner, first = iter(every), list[list[int]](), set[SSHMap]()
+        while self._task.theory.displacement == "use" and len(first) < SOONER and (labels := next(left, None)):
+            sooner.append(labels)
+            for found in self._fitting.maps(labels, mode, parts=PARTS):
+                first.add(found.map)
+                yield found
+        yield from (found for labels in chain(sooner, left) for found in self._fitting.maps(labels, mode) if found.map not in first)
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
         mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
@@ -290,7 +306,7 @@ class PlacesAndPaths:
         *,
         far: Collection[_Far] = (),
         single: bool = False,
-        parts: Iterable[str] = ("base", "least", "paths"),
+        parts: Iterable[str] = PARTS,
     ) -> clingo.Control:
         """A control for the places and paths of dstates that are linked so, and of these."""
         control = Control(options, self._asker.watch.check, PREPARING)
@@ -301,12 +317,12 @@ class PlacesAndPaths:
         control.ground([(part, []) for part in parts])
         return control
 
-    def _path_control(self, labels: Sequence[int], options: Sequence[str] = ()) -> clingo.Control:
+    def _path_control(self, labels: Sequence[int], options: Sequence[str] = (), parts: Sequence[str] = (*PARTS, *EACH)) -> clingo.Control:
         """A control for the places and paths that fit these labels of all steps. The last one is kept, as the next question is often to it."""
-        key = tuple(labels), tuple(options)
+        key = tuple(labels), tuple(options), tuple(parts)
         if self._asked is None or self._asked[0] != key:
             with self._asker.grounding_timed():
-                control = self._control_for(self._links_of(labels), labels, options, far=self._far_away(labels))
+                control = self._control_for(self._links_of(labels), labels, options, far=self._far_away(labels), parts=parts)
             self._asker.watch.check()
             self._asked = key, control
         return self._asked[1]
@@ -323,9 +339,11 @@ class PlacesAndPaths:
         if not proven:
             yield from self.maps(labels, "opt", options=["--opt-strategy=usc"])
 
-    def maps(self, labels: Sequence[int], mode: str, conflicts: int = -1, options: Sequence[str] = ()) -> Generator[Found, None, bool]:
-        """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
-        control = self._path_control(labels, options)
+    def maps(
+        self, labels: Sequence[int], mode: str, conflicts: int = -1, options: Sequence[str] = (), parts: Sequence[str] = (*PARTS, *EACH)
+    ) -> Generator[Found, None, bool]:
+        """Maps with these dstates: without EACH one for each choice of places. Returns whether clingo came to an end, and not to the limit of conflicts."""
+        control = self._path_control(labels, options, parts)
         reader = facts.PathReader(control, self._task.trace, self._task.theory, self.named.chart, labels)
         answers = self._asker.answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
         return (yield from mapped(lambda answer: Found.of(reader.map_of(answer).without_headings(), self._task.theory), answers))

@@ -120,7 +120,7 @@ class Paths:
         control.ground([("base", []), *([("again", [])] if single else []), ("least", [])])
         if self._pinned and not single:
             control.add("pinned", [], facts.pinned_facts(_pairwise_distinct(*facts.read_rivals(control))))
-        control.ground([("pinned", []), ("paths", [])])
+        control.ground([("pinned", []), ("paths", []), ("each", [])])
         return control
 
     def telling(self, chart: FramedChart, labels: Sequence[int], loose: Iterable[int]) -> clingo.Control:
