@@ -30,6 +30,7 @@ from ssh_abduction.theory.theory import EXCUSED
 from ssh_abduction.trace import Trace
 
 FEW_STEPS = 14  # An argument about so few steps may speak of all of them. In a longer piece it speaks of those that the axioms name, as conclusions are many.
+IN_A_LINE, INDENT = 2, " " * 7  # More reasons than these have a line each, with this indent.
 OF_ACTIONS = EXCUSED["slipped"] | {"branch_side"}  # axioms that are broken at a step by the action that led to it
 # What has one value for a dstate. A map shows only that value, so an axiom of these should hold in a map that the checker is to judge.
 SHOWN = ("one_place", "one_course", "one_heading", "functional_view", "deterministic")
@@ -151,8 +152,15 @@ class Derivation:
                 supposed = True
             by = f" (by {', '.join(str(p + 1) for p in inference.premises)})" if inference.premises else ""
             names = "; ".join(f"{link.axiom}, {_steps(link.steps)}" for link in inference.links)
-            named = f" [{names}]" if names else ""
-            lines.append(f"{number:3}. {'; '.join(inference.says)}{by}: {'; '.join(inference.because)}{named}")
+            says, because = f"{number:3}. {'; '.join(inference.says)}{by}:", [*inference.because]
+            named = [f"[{names}]"] if names else []
+            if len(because) > IN_A_LINE:
+                lines += [says, *(f"{INDENT}{line}" for line in (*because, *named))]
+            else:
+                lines.append(" ".join([says, "; ".join(because), *named]))
+        short = self.summary.split("; ")
+        if len(short) > IN_A_LINE + 1:
+            return "\n".join([*lines, "in short:", *(f"{INDENT}{part}" for part in short)])
         return "\n".join([*lines, f"in short: {self.summary}"])
 
     def to_dict(self) -> dict[str, Any]:
