@@ -27,8 +27,8 @@ ASKEW = np.radians(np.arange(-50.0, 51.0, 10.0))
 ASIDE = 3.0
 # A door is at most so wide, in metres, and the way is wider by such a share within so many metres before and after it.
 DOOR, WIDER, BESIDE = 1.6, 1.33, 2.0
-# Two doors are at least so many metres of the way apart.
-DEEP = 1.0
+# Two doors are at least so many metres of the way apart, and between them the way is wider than either by that share.
+DEEP = 0.5
 # A building is one of rooms if its corridors would be wider than this, in metres, and the robot drives through a door at least once in so many metres.
 WIDE, OFTEN = 2.5, 20.0
 # Two doors are one if their middles are nearer than this, in metres.
@@ -75,7 +75,8 @@ def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
         before, after = widths[(ways < ways[k]) & (ways >= ways[k] - BESIDE)], widths[(ways > ways[k]) & (ways <= ways[k] + BESIDE)]
         if not len(before) or not len(after) or min(before.max(), after.max()) < WIDER * widths[k]:
             continue
-        if all(abs(door.way - ways[k]) > DEEP for door in found):
+        apart = [widths[(ways >= min(door.way, ways[k])) & (ways <= max(door.way, ways[k]))].max() >= WIDER * widths[k] for door in found]
+        if all(apart) and all(abs(door.way - ways[k]) > DEEP for door in found):
             found.append(Door(int(np.searchsorted(track.way, ways[k], side="right")), gaps[k][1], float(widths[k]), float(ways[k])))
     return tuple(sorted(found, key=lambda door: door.way))
 
