@@ -29,8 +29,8 @@ ASIDE = 3.0
 DOOR, WIDER, BESIDE = 1.6, 1.33, 2.0
 # Two doors are at least so many metres of the way apart, and between them the way is wider than either by that share.
 DEEP = 0.5
-# A building is one of rooms if its corridors would be wider than this, in metres, and the robot drives through a door at least once in so many metres.
-WIDE, OFTEN = 2.5, 20.0
+# A building is one of rooms if most of the way is wider than this, in metres, and the robot drives through a door at least once in so many metres.
+WIDE, OFTEN = 2.2, 20.0
 # Two doors are one if their middles are nearer than this, in metres.
 SAME = 0.6
 
@@ -95,7 +95,7 @@ def _gap(occupied: Bools, patch: Patch, at: Array, across: float) -> tuple[float
 
 def is_wide(scale: Scale) -> bool:
     """Whether most of the building is wider than corridors are, so that it may be one of rooms."""
-    return scale.corridor > WIDE
+    return scale.most > WIDE
 
 
 def has_rooms(scale: Scale, doors: Sequence[Door], track: Track) -> bool:

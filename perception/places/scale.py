@@ -18,6 +18,8 @@ EVERY = 0.5
 ASIDE = 6.0
 # The narrow passages of the way are those at this percentile, and its corridors those at this one.
 NARROW, CORRIDOR = 5, 20
+# Most of the way is at least as wide as this percentile.
+MOST = 30
 # A gateway is at least such a share of a narrow passage wide: walls look thicker in a grid than they are, and the robot needs less room than it had.
 SHARE = 0.75
 # A place is looked at from its middle to so many corridor widths away: beyond the mouths of its gateways, and not as far as the next place.
@@ -30,13 +32,13 @@ class Scale:
 
     gateway   the least width of a way out that counts as a gateway
     radius    how far a way out must lead from the middle of a place
-    corridor  how wide corridors are: most of the robot's way is at least so wide
+    most      most of the robot's way is at least so wide
     doors     whether the places of the building are the doors between its rooms; if not, they are where ways part or bend
     """
 
     gateway: float
     radius: float
-    corridor: float = 0.0
+    most: float = 0.0
     doors: bool = False
 
     @property
@@ -65,11 +67,11 @@ def suggested(scans: Sequence[Scan], track: Track) -> Scale:
             patch = maps.around(i, track.poses[i, :2], ASIDE + 1)
             left = np.array([-ahead[1], ahead[0]]) / length
             widths.append(_free_along(patch, track.poses[i, :2], left) + _free_along(patch, track.poses[i, :2], -left))
-    narrow, corridor = np.percentile(widths, [NARROW, CORRIDOR]) if widths else (1.2, 1.7)
+    narrow, corridor, most = np.percentile(widths, [NARROW, CORRIDOR, MOST]) if widths else (1.2, 1.7, 1.7)
     return Scale(
         gateway=round(float(np.clip(SHARE * narrow, 0.5, 2.0)), 2),
         radius=round(float(np.clip(RADII * corridor, 3.0, 8.0)), 2),
-        corridor=round(float(corridor), 2),
+        most=round(float(most), 2),
     )
 
 
