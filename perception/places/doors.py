@@ -30,7 +30,7 @@ DOOR, WIDER, BESIDE = 1.6, 1.33, 2.0
 # Two doors are at least so many metres of the way apart, and between them the way is wider than either by that share.
 DEEP = 0.5
 # A building is one of rooms if most of the way is wider than this, in metres, and the robot drives through a door at least once in so many metres.
-WIDE, OFTEN = 2.2, 20.0
+WIDE, OFTEN = 2.2, 30.0
 # Two doors are one if their middles are nearer than this, in metres.
 SAME = 0.6
 
