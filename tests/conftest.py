@@ -1,8 +1,21 @@
-"""Settings of all tests."""
+"""Settings of all tests: how fast the machine is, and whether somebody watches it, decides nothing."""
+
+import contextlib
+import math
+import signal
 
 from hypothesis import HealthCheck, settings
 
-# How fast the machine is decides nothing: not whether an example takes too long, nor whether it takes too long to draw one. And the examples are the same in each
-# run: of traces at random, some take clingo a hundred times as long as others.
+from ssh_abduction.cli import verbosity
+
+# No example takes too long, nor does it take too long to draw one. And the examples are the same in each run: of traces at random, some take clingo a hundred
+# times as long as others.
 settings.register_profile("the same everywhere", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("the same everywhere")
+
+# No line of progress comes where a command takes long; tests of these lines say when they come.
+verbosity.EVERY = math.inf
+
+# Programs that are begun in the background do not hear Ctrl-C, nor do those that they begin. Tests do, from any thread that is the main one.
+with contextlib.suppress(ValueError):
+    signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -204,7 +204,20 @@ def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
     monkeypatch.setattr(mapping, "MapQuestion", KilledOnce)
     assert main(["simulate", "notched-rectangle", "--as", "carmen", "--every", "0.5", "-q", "-o", quick]) == 0
     shutil.copy(quick, deadly)
-    command = ["map", quick, deadly, "-o", str(tmp_path / "runs"), "--no-ladder", "--scheduler", scheduler, "--jobs", "1"]
+    command = [
+        "map",
+        quick,
+        deadly,
+        "-o",
+        str(tmp_path / "runs"),
+        "--no-ladder",
+        "--time-limit",
+        "1000",
+        "--scheduler",
+        scheduler,
+        "--jobs",
+        "1",
+    ]
     capsys.readouterr()
     for said in ("1 place", "done already"):
         assert main(command) == 0

@@ -92,7 +92,7 @@ def test_what_is_unique_is_what_solve_lists() -> None:
         chance = random.Random(seed)
         ends = {s: {action: chance.randrange(6) for action in ("p", "q")} for s in range(6)}
         robot = Machine("aabbaa", ends)
-        explorer = Explorer(robot, Theory.causal(), margin=0)
+        explorer = Explorer(robot, Theory.causal(), margin=0, limit=None)
         been = [0]
         while explorer.step():
             been.append(robot.at)
@@ -105,7 +105,7 @@ def test_what_is_unique_is_what_solve_lists() -> None:
 
 
 def test_steps_that_are_spent_are_said() -> None:
-    found = Explorer(Streetwalker(RING, "a", "E", told=False)).explore(3)
+    found = Explorer(Streetwalker(RING, "a", "E", told=False), limit=None).explore(3)
     assert (found.steps, found.ending, found.is_true) == (3, "steps", None)
     assert "its steps are spent" in found.sentence
 
@@ -113,7 +113,7 @@ def test_steps_that_are_spent_are_said() -> None:
 def test_rivals_that_nothing_tells_apart_are_said() -> None:
     # The robot is at the last state, which may be 0 or 2: p would tell, and cannot be done there.
     one_way = {0: {"p": 1}, 1: {"n": 2}, 2: {"p": 3}, 3: {"n": 4}, 4: {}}
-    explorer = Explorer(Machine("axaza", one_way), Theory.causal())
+    explorer = Explorer(Machine("axaza", one_way), Theory.causal(), limit=None)
     found = explorer.explore(50)
     assert (found.steps, found.ending, found.is_unique, found.is_true) == (4, "inseparable", False, False)
     assert len(solve(explorer.trace, Theory.causal(), maps=0)) == found.solution.count > 1
@@ -121,7 +121,7 @@ def test_rivals_that_nothing_tells_apart_are_said() -> None:
 
 
 def test_the_map_of_a_world_that_hides_its_states_is_not_true() -> None:
-    blind = Explorer(Machine("aaa", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 0}}), Theory.causal()).explore(50)
+    blind = Explorer(Machine("aaa", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 0}}), Theory.causal(), limit=None).explore(50)
     assert (blind.ending, blind.is_unique, blind.is_true) == ("done", True, False)
     assert "not true" in blind.sentence
 
@@ -130,7 +130,7 @@ def test_a_margin_finds_what_the_fewest_dstates_hide() -> None:
     found = {}
     for margin in (0, 2):
         ring = Machine("abbc", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 3}, 3: {"on": 0}})
-        found[margin] = Explorer(ring, Theory.causal(), margin=margin).explore(50)
+        found[margin] = Explorer(ring, Theory.causal(), margin=margin, limit=None).explore(50)
     assert {margin: (said.ending, said.is_true) for margin, said in found.items()} == {0: ("done", False), 2: ("done", True)}
     assert found[0].steps == 2  # after a, b, b it takes the last two for one
     assert found[2].steps >= 4
@@ -153,7 +153,7 @@ class Crooked(Streetwalker):
 
 
 def test_no_map_is_said() -> None:
-    explorer = Explorer(Crooked(TEE, "W", "E", told=False))
+    explorer = Explorer(Crooked(TEE, "W", "E", told=False), limit=None)
     found = explorer.explore(10)
     assert (found.ending, found.is_unique, found.solution.status) == ("contradicted", False, Status.UNSATISFIABLE)
     assert solve(explorer.trace).status is Status.UNSATISFIABLE
@@ -161,7 +161,7 @@ def test_no_map_is_said() -> None:
 
 
 def test_a_step_goes_on_where_exploring_was_left() -> None:
-    whole, parts = (Explorer(Streetwalker(CORRIDOR, "a", "E"), margin=0) for _ in range(2))
+    whole, parts = (Explorer(Streetwalker(CORRIDOR, "a", "E"), margin=0, limit=None) for _ in range(2))
     whole.explore(100)
     while parts.explore(1).ending == "steps":
         pass
@@ -194,6 +194,6 @@ def test_bad_input_is_refused(build: Any, error: type[SSHError], message: str) -
 
 
 def test_a_robot_that_can_do_nothing_is_done_at_once() -> None:
-    found = Explorer(Machine("a", {0: {}})).explore(10)
+    found = Explorer(Machine("a", {0: {}}), limit=None).explore(10)
     assert isinstance(found, Exploration)
     assert (found.steps, found.ending, found.is_unique, found.is_true) == (0, "done", True, True)

@@ -177,7 +177,7 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: The
     assert found.complete
 
 
-@pytest.mark.parametrize("limit", [0.5, 3])
+@pytest.mark.parametrize("limit", [0.5, 2])
 def test_a_limit_ends_the_search_beside(limit: float) -> None:
     """While it guesses, or while it asks clingo. What is left is a map, and a bound."""
     trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(400)
@@ -237,7 +237,7 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(trace: Trace, the
             assert answer.count == expected.count
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
     """Long enough for cores, for visits told to be transitive, and for paths, all of which the longer trace keeps."""
     trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
@@ -258,7 +258,7 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
     assert seed != 0 or any(told for _, told in paths)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_each_speedup_off_alone(seed: int) -> None:
     """On walks long enough for cores, for visits that have to be told to be transitive, and for maps that are found nearby."""
     trace = maze(2, 2, steps=45, seed=seed, stars=True).trace
@@ -295,7 +295,7 @@ def test_pairs_that_are_too_many_are_not_listed() -> None:
     chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
     assert chart.fitting[-1] == len(chart.fits(range(len(chart.stars)))) > 50
     with patch.object(same, "SECONDS_A_PAIR", 1000.0), patch.object(FramedChart, "fits", side_effect=AssertionError):
-        solution = solve(trace, limit=30)
+        solution = solve(trace, limit=100)
     assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
     assert check(trace, solution.maps[0], solution.theory) == ()
 
@@ -447,14 +447,13 @@ def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
     assert check(walk.trace, solution.maps[0], Theory.topological()) == ()
 
 
-@pytest.mark.parametrize(("seed", "fewest", "paths"), [(1, 58, 5), (2, 53, 7)])
-def test_a_maze_half_explored_is_mapped(seed: int, fewest: int, paths: int) -> None:
-    """Few views tell little: order and sides have to. In the last one some dstates have no paths though no single path shows it."""
-    trace = maze(10, 10, steps=4000, seed=seed, stars=True).trace.prefix(150)
-    solution = solve(trace, Theory.topological(), maps=3, limit=60)
+def test_a_maze_half_explored_is_mapped() -> None:
+    """Few views tell little: order and sides have to. Some dstates have no paths though no single path shows it."""
+    trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(150)
+    solution = solve(trace, Theory.topological(), maps=3)
     assert solution.status is Status.OPTIMAL
     assert solution.cost
-    assert (solution.cost.dstates, solution.cost.paths) == (fewest, paths)
+    assert (solution.cost.dstates, solution.cost.paths) == (53, 7)
     for ssh_map in solution.maps:
         assert check(trace, ssh_map, Theory.topological()) == ()
 
@@ -490,7 +489,7 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
 def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
     """Else the time that is kept for any map would be spent on the engine of a shorter prefix, and its map be taken for the whole trace's."""
     walk = maze(3, 3, steps=120, seed=1, stars=True)
-    search = Search(walk.trace, Theory.topological(), limit=30)
+    search = Search(walk.trace, Theory.topological(), limit=100)
     engine = search._prefixes.engine
     engine.grow(40)
     with patch.object(engine._visits, "_charted", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
@@ -506,7 +505,7 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
 def test_ctrl_c_in_the_last_part_of_the_time_leaves_no_engine_to_go_on_with() -> None:
     """Perhaps clingo was told half of a core: what it would say then of the longer trace may be wrong."""
     trace = maze(3, 3, steps=80, seed=1, stars=True).trace
-    search = Search(trace.prefix(70), Theory.topological(), limit=30)
+    search = Search(trace.prefix(70), Theory.topological(), limit=100)
     with patch.object(Prefixes, "minimise", side_effect=[LimitError("time limit"), KeyboardInterrupt]):
         assert [check(search.trace, ssh_map, search.theory) for ssh_map in search] == [()]
     assert search.stopped == "interrupted"
@@ -661,7 +660,7 @@ def test_a_true_guess_stays_as_it_is(seed: int) -> None:
     assert asked._paths.labels_near(chart, apart, some) == truth
 
 
-@pytest.mark.parametrize(("size", "steps", "seed"), [(5, 300, 0), (6, 300, 2), (7, 400, 1)])
+@pytest.mark.parametrize(("size", "steps", "seed"), [(5, 300, 0), (6, 300, 2)])
 def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, seed: int) -> None:
     """Where the causal axioms do not show that they are two, but paths do."""
     walk = maze(size, size, steps=steps, seed=seed, stars=True)

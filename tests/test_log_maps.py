@@ -50,7 +50,7 @@ def runs(hall: Path) -> Path:
     """What `map` writes of it, and of a log that cannot be read."""
     bad = hall.with_name("bad.log")
     bad.write_text("nothing\n")
-    assert main(["map", str(hall), str(bad), "-o", str(hall.parent / "runs"), "--no-ladder", "--time-limit", "40"]) == 1
+    assert main(["map", str(hall), str(bad), "-o", str(hall.parent / "runs"), "--no-ladder", "--time-limit", "1000"]) == 1
     return hall.parent / "runs"
 
 
@@ -128,7 +128,7 @@ def test_waves_go_around_walls() -> None:
 
 def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(hall: Path, runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bad = hall.with_name("bad.log")
-    assert main(["map", str(hall), str(bad), "-o", str(runs), "--no-ladder", "--time-limit", "40"]) == 1
+    assert main(["map", str(hall), str(bad), "-o", str(runs), "--no-ladder", "--time-limit", "1000"]) == 1
     told = capsys.readouterr()
     assert f"{hall}: done already, in {runs / 'hall'}" in told.out
     assert f"{bad}: expected a robot's log" in told.out
@@ -220,7 +220,7 @@ def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.Captur
 
 
 def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_alone(hall: Path, tmp_path: Path) -> None:
-    question = MapQuestion(None, {}, (None, None, None), None, None, None, 40.0, 1, False)
+    question = MapQuestion(None, {}, (None, None, None), None, None, None, 1000.0, 1, False)
     small = tmp_path / "small.log"
     small.write_text("\n".join(hall.read_text().splitlines()[:160]) + "\n")
     (answer,) = batch.here(question, [str(small)], 2, batch.Stop(tmp_path / "stop"))

@@ -75,7 +75,7 @@ def test_a_theory_without_what_it_rests_on_has_no_certificate() -> None:
 
 
 def test_a_mapper_gives_a_certificate() -> None:
-    mapper = OnlineMapper("a", Theory.causal())
+    mapper = OnlineMapper("a", Theory.causal(), limit=None)
     for view in "bab":
         mapper.observe("travel", view)
     assert mapper.solution.certificate is not None

@@ -257,7 +257,7 @@ def test_rivals_are_weighed_by_faults_and_by_what_they_assume() -> None:
 
 
 def test_what_does_not_fit_is_refused_and_changes_nothing() -> None:
-    mapper = OnlineMapper("v0", BOTH)
+    mapper = OnlineMapper("v0", BOTH, limit=None)
     before = mapper.observe("right", "v1")
     with pytest.raises(TraceError, match="action"):
         mapper.observe({"name": "right", "kind": "travel"}, "v2")

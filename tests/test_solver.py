@@ -224,9 +224,9 @@ def test_a_stream_of_millions_starts_at_once() -> None:
     """One and a half circuits have 20,289 consistent maps without sides; three have far more than anyone waits for."""
     theory = Theory(boundary="none", path_order="partial", prefer=())
     search = Search(rectangle(24), theory, maps=0)
-    first = list(itertools.islice(search, 2000))
-    assert len(set(first)) == 2000
-    assert search.count == 2000
+    first = list(itertools.islice(search, 400))
+    assert len(set(first)) == 400
+    assert search.count == 400
 
 
 def test_nothing_preferred_means_all_consistent_maps() -> None:

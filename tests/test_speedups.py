@@ -116,8 +116,8 @@ CASES = {
     "causal": (moore(6, 2, steps=60, seed=1).trace, Theory.causal()),
     "topological": (CIRCUITS, Theory.topological()),
     "circumscriptive": (CIRCUITS, Theory.circumscriptive()),
-    "framed": (maze(3, 3, steps=40, seed=0, stars=True).trace, Theory.topological()),
-    "frameless": (maze(2, 2, steps=30, seed=1).trace, Theory.topological()),
+    "framed": (maze(3, 3, steps=26, seed=0, stars=True).trace, Theory.topological()),
+    "frameless": (maze(2, 2, steps=22, seed=1).trace, Theory.topological()),
 }
 
 

@@ -51,7 +51,7 @@ def misread() -> tuple[Trace, Solution]:
 
 
 def online() -> tuple[Trace, Solution]:
-    mapper = OnlineMapper("v0", Theory.causal())
+    mapper = OnlineMapper("v0", Theory.causal(), limit=None)
     for t in range(1, 10):
         mapper.observe(("right", "travel")[(t - 1) % 2], f"v{t % 4}")
     solution = mapper.observe("travel", "v2")
