@@ -255,6 +255,18 @@ def test_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", str(rectangle)]) == 0
 
 
+def test_maps_tell_the_theory_that_is_explained_by(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trace, maps = str(tmp_path / "impossible.jsonl"), tmp_path / "maps.json"
+    IMPOSSIBLE.save(trace)
+    solve(IMPOSSIBLE, Theory.causal()).save(maps)
+    assert main(["explain", trace, "0", "1"]) == 20
+    assert main(["explain", trace, "0", "1", "--theory-of", str(maps)]) == 0
+    assert "functional_view" in capsys.readouterr().out
+    maps.write_text(json.dumps({"maps": []}))
+    assert main(["explain", trace, "0", "1", "--theory-of", str(maps)]) == 1
+    assert "expected the theory that the maps were made with" in capsys.readouterr().err
+
+
 def test_keys_are_labels_first() -> None:
     """`compare` reads labels out of the keys of the brute force."""
     (ssh_map,) = solve(RECTANGLE.prefix(5)).maps

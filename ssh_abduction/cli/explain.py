@@ -7,10 +7,12 @@ from typing import Any
 
 from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.cli.options import Verbs, add_theory, read_maps, theory_of
 from ssh_abduction.cli.outcome import dump, interrupted_code, on_ctrl_c
-from ssh_abduction.errors import SSHError
+from ssh_abduction.errors import MapError, SSHError, named
 from ssh_abduction.rivals.explain import PairExplanation, PairQuestion, TraceExplanation, TraceQuestion, Verdict
+from ssh_abduction.solver.recorded import theory_in
+from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
@@ -30,7 +32,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("--json", action="store_true", help="print the explanation as JSON")
     parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds with what is known by then")
     parser.add_argument("--memory-limit", type=int, metavar="MIB", help="stop when the process has used so much memory")
-    add_theory(parser)
+    parser.add_argument("--theory-of", metavar="MAPS", help="explain by the theory that this file of maps was made with")
+    add_theory(parser, default="that of --theory-of; else topological, or causal with --level causal")
     parser.epilog = "Exit codes: 0 explained; 20 the trace has no map; 30 not found out in time; 1, 2, 130 and 143 as for the other verbs."
     parser.set_defaults(run=run)
 
@@ -38,7 +41,8 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     if len(options.steps) not in (0, 2):
         raise SSHError(f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are to be explained")
-    trace, theory = Trace.load(options.trace), theory_of(options)
+    trace = Trace.load(options.trace)
+    theory = theory_of(options, _theory_in(options.theory_of) if options.theory_of else None)
     limits: dict[str, Any] = {"limit": options.time_limit, "memory": options.memory_limit}
     question: PairQuestion | TraceQuestion
     if options.steps:
@@ -56,6 +60,14 @@ def run(options: argparse.Namespace) -> int:
         answer = question.answer()
         guard.say(lambda: told(answer))
     return _exit_code(answer)
+
+
+def _theory_in(file: str) -> Theory:
+    """The theory that a file of maps was made with. Raises MapError."""
+    data = read_maps(file)
+    if not isinstance(data, dict) or "theory" not in data:
+        raise MapError(f"{named(file)}: theory: expected the theory that the maps were made with, got none; name it with --theory")
+    return theory_in(data["theory"], named(file))
 
 
 def _as_text(explanation: PairExplanation | TraceExplanation) -> str:
