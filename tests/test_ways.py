@@ -21,7 +21,9 @@ from ssh_abduction.engines.frameless import FramelessEngine
 from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.judge.checker import check
 from ssh_abduction.judge.proof import check_bound
+from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import search as solver
+from ssh_abduction.solver.judging import Judging
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.speedups import SPEEDUPS
 
@@ -136,6 +138,29 @@ def test_the_route_of_a_robot() -> None:
     assert found.cost
     assert found.cost.to_dict() == {"dstates": 19, "places": 9, "paths": 4}
     assert len(set(found.maps)) == found.count == 38
+
+
+@pytest.mark.parametrize("settled", [False, True], ids=["step by step", "dstates first"])
+def test_maps_that_are_refused_do_not_count_among_those_that_are_listed(settled: bool) -> None:
+    """Two steps may not be at one place, which they are in most of the minimal maps: few maps are no complete list, and all that are left are found."""
+    trace, theory = Trace.load(EXAMPLES / "aces3-route.jsonl"), Theory(star="none", prefer=("dstates", "places", "paths"))
+    every = solve(trace, theory, maps=0).maps
+    pairs = [(i, j) for j in range(len(trace)) for i in range(j)]
+    held = {(i, j): sum(m.place_of(i) == m.place_of(j) for m in every) for i, j in pairs}
+    first, second = max((pair for pair in pairs if held[pair] < len(every)), key=lambda pair: held[pair])
+
+    def refusal(_: Judging, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
+        refused = len(ssh_map.labels) > second and ssh_map.place_of(first) == ssh_map.place_of(second)
+        return ("test", frozenset({Equality(first, second, "place")})) if refused else None
+
+    with (
+        patch.multiple(Judging, refusal=refusal, may_refuse=True),
+        patch.multiple(solver, FRAME_AFTER=-1.0 if settled else 60.0, FEW_STEPS=0 if settled else 24),
+    ):
+        few, left = solve(trace, theory, maps=1), solve(trace, theory, maps=0)
+    assert set(left.maps) == {m for m in every if m.place_of(first) != m.place_of(second)}
+    assert (left.complete, few.complete, few.count) == (True, False, 1)
+    assert left.count == len(left.maps) == len(every) - held[first, second] > 1
 
 
 def test_few_of_many_maps() -> None:

@@ -191,9 +191,10 @@ class FramelessEngine:
         )
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
-        self._best = None
         self._fitting.forbid_together(equalities)
         self._named.forbid_together([(equality.first, equality.second) for equality in equalities])  # as one dstate is at one place
+        if self._best:  # maps of that cost that are left have some of these labels
+            self._best = self._best[0], [labels for labels in self._best[1] if self._named.is_allowed(labels)]
         return True
 
     def settle(self) -> None:

@@ -214,7 +214,7 @@ class NamedLabels:
         self._seeking = True
         try:
             for labels in self._searched():
-                if self._is_allowed(labels):
+                if self.is_allowed(labels):
                     self.known = labels
                     yield labels
         except (LimitError, KeyboardInterrupt) as end:
@@ -295,7 +295,7 @@ class NamedLabels:
         """Whether a map with as few dstates as the bound is known already, while one is sought. What lists all of them goes on."""
         return self._seeking and self._is_settled()
 
-    def _is_allowed(self, labels: Sequence[int]) -> bool:
+    def is_allowed(self, labels: Sequence[int]) -> bool:
         """Whether labels keep what evidence says of pairs of steps. That each action leads to one dstate by them is known."""
         if any(all(labels[i] == labels[j] for i, j in pairs) for pairs in self._forbidden):
             return False
@@ -304,7 +304,7 @@ class NamedLabels:
     def forbid_together(self, pairs: Collection[tuple[int, int]]) -> None:
         """From now on these pairs of steps are not all one dstate."""
         self._forbidden.append(list(pairs))
-        if self.known and not self._is_allowed(self.known):
+        if self.known and not self.is_allowed(self.known):
             self.known = None
         self._tell_forbidden(len(self._forbidden) - 1)
 
@@ -438,7 +438,7 @@ class NamedLabels:
     def _absorb(self, labels: list[int] | None, bound: int) -> None:
         """Take what a search near a guess knows, which knows nothing of pairs of steps that evidence speaks of."""
         fewer = labels is not None and (self.known is None or len(set(labels)) < len(set(self.known)))
-        if labels is not None and fewer and self._is_allowed(labels):
+        if labels is not None and fewer and self.is_allowed(labels):
             self.known = labels
         self.bound = max(self.bound or 0, bound)
 

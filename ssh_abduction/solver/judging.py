@@ -50,6 +50,11 @@ class Judging:
         self._a_step = A_STEP  # seconds that a step takes, by the last check
         self._shown = not UNSHOWN & theory.given_up
 
+    @property
+    def may_refuse(self) -> bool:
+        """Whether there is evidence that may find out of a map that it is none."""
+        return bool(self._evidence)
+
     def why_refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
         """Equalities of a map, of the trace or a prefix, that some evidence finds out cannot all hold; None where it refuses none."""
         refusal = self.refusal(ssh_map)

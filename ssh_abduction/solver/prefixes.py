@@ -26,6 +26,7 @@ _log = log_of(__name__)
 
 FIRST_PREFIX = 8  # The first prefix has so many steps: solving it costs next to nothing.
 HELD_BACK = 1000  # So many maps are kept until a prefix proves long enough; from there on they stream, so that memory stays constant.
+REMEMBERED = 10_000  # So many maps are remembered where all are asked for and evidence may refuse some: until then what is refused is forbidden while maps are listed.
 FIRST_PATHS = (
     8  # So many names for paths there are to begin with: few traces need more, and grounding grows with the square of their number.
 )
@@ -92,8 +93,7 @@ class Prefixes:
 
     def _forbid(self, equalities: frozenset[Equality]) -> None:
         """Let no map have all of these equalities; where the engine cannot be told, another one goes on that can."""
-        can_be_told = isinstance(self.engine, StepEngine) or all(equality.holds for equality in equalities)
-        if can_be_told and self.engine.forbid(equalities):
+        if self._tell(equalities):
             return
         _log.debug("%s cannot be told so: the readable encodings go on", type(self.engine).__name__)
         self.engine.settle()
@@ -101,6 +101,11 @@ class Prefixes:
         self.engine = StepEngine(self._task, facts.most_paths(self._task.trace, theory, len(self._task.trace)))
         self.engine.grow(size)
         self.engine.forbid(equalities)
+
+    def _tell(self, equalities: frozenset[Equality]) -> bool:
+        """Tell the engine that no map has all of these equalities. False where it cannot be told so."""
+        can_be_told = isinstance(self.engine, StepEngine) or all(equality.holds for equality in equalities)
+        return can_be_told and self.engine.forbid(equalities)
 
     def _minimise_as_told(self) -> Found | None:
         """A minimal map of the prefix by what clingo was told, or None. Better maps of the whole trace are kept on the way."""
@@ -158,27 +163,44 @@ class Prefixes:
         Returns the farthest step that some map fails at; 0 where all replay, so that there are no others.
         """
         enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
+        asked = self._most and self._most + 1
         streaming = self.engine.size == len(self._task.trace)
-        stuck = 0
-        for found in self.engine.maps_of_cost(self._known.cost, self._most and self._most + 1):
-            replayed = self._replay(found.map)
-            if replayed.outcome is not Outcome.PREDICTED:
-                stuck = max(stuck, len(replayed.labels))
-                if not streaming:
-                    break
+        stuck, telling = 0, True
+        given = set[SSHMap]()  # or held back, where some maps may be refused
+        while True:
+            came, refusal = 0, None
+            for found in self.engine.maps_of_cost(self._known.cost, asked):
+                came += 1
+                replayed = self._replay(found.map)
+                if replayed.outcome is not Outcome.PREDICTED:
+                    stuck = max(stuck, len(replayed.labels))
+                    if not streaming:
+                        break
+                    continue
+                whole = self._whole(found.map, replayed)
+                if whole in given or any(self._replay(found.map, size).outcome is Outcome.PREDICTED for size in streamed):
+                    continue
+                if self._judging.why_refused(whole):
+                    refusal = self._judging.why_refused(found.map) if telling and (asked or len(given) < REMEMBERED) else None
+                    if refusal:
+                        break
+                    continue
+                if self._judging.may_refuse and (asked or len(given) < REMEMBERED):
+                    given.add(whole)
+                if streaming:
+                    yield whole
+                    continue
+                held.append(whole)
+                if len(held) == enough:
+                    streaming = True
+                    yield from held
+                    held.clear()
+            if refusal:  # all is listed anew, without what is refused if the engine can be told
+                telling = self._tell(refusal)
                 continue
-            whole = self._whole(found.map, replayed)
-            was_given = any(self._replay(found.map, size).outcome is Outcome.PREDICTED for size in streamed)
-            if was_given or self._judging.why_refused(whole):
-                continue
-            if streaming:
-                yield whole
-                continue
-            held.append(whole)
-            if len(held) == enough:
-                streaming = True
-                yield from held
-                held.clear()
+            if stuck or not asked or came < asked:
+                break
+            asked *= 2  # as many maps came as were asked for, but some of these were refused: there may be others
         if stuck and streaming:
             streamed.append(self.engine.size)
         return stuck
