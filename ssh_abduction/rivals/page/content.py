@@ -142,12 +142,25 @@ def _choice(data: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _differences(items: Sequence[Sequence[Any]]) -> list[Any]:
-    """Each item; after the first one what differs from it alone, as {index: value}, where it is as long and that is shorter."""
-    told: list[Any] = []
-    for item in items:
-        differing = {str(i): value for i, (value, first) in enumerate(zip(item, items[0], strict=False)) if value != first}
-        told.append(differing if told and len(item) == len(items[0]) and 2 * len(differing) < len(item) else item)
+def _differences(items: Sequence[Sequence[tuple[Any, Any, Any]]]) -> list[Any]:
+    """The place, path and direction of each dstate in each map; after the first one what differs from it alone, as {index: value}, where that is shorter.
+
+    As paths are numbered by first visit, one street more or less gives others another number: `paths` tells what the paths of the first map are mostly called, where that is another name.
+    """
+    first = items[0]
+    told: list[Any] = [first]
+    for item in items[1:]:
+        called: dict[Any, Counter[Any]] = {}
+        for (_, before, _), (_, now, _) in zip(first, item, strict=False):
+            called.setdefault(before, Counter())[now] += 1
+        names = {before: counts.most_common(1)[0][0] for before, counts in called.items() if before is not None}
+        expected = [(place, names.get(path, path), direction) for place, path, direction in first]
+        differing: dict[str, Any] = {str(i): value for i, (value, other) in enumerate(zip(item, expected, strict=False)) if value != other}
+        if len(item) == len(first) and 2 * len(differing) < len(item):
+            renamed = {str(before): now for before, now in names.items() if before != now}
+            told.append({**differing, **({"paths": renamed} if renamed else {})})
+        else:
+            told.append(item)
     return told
 
 

@@ -52,7 +52,8 @@ function whereIn(i) {
   const number = data.maps[i].places;
   if (!placed.has(number)) {
     const first = data.places[0], raw = data.places[number];
-    placed.set(number, Array.isArray(raw) ? raw : first.map((value, k) => raw[k] ?? value));
+    const named = ([place, path, direction]) => [place, raw.paths?.[path] === undefined ? path : raw.paths[path], direction];
+    placed.set(number, Array.isArray(raw) ? raw : first.map((value, k) => raw[k] ?? named(value)));
   }
   return placed.get(number);
 }
