@@ -31,8 +31,8 @@ DOOR, WIDER, BESIDE = 1.6, 1.33, 2.0
 DEEP = 0.5
 # A building is one of rooms if most of the way is wider than this, in metres, and the robot drives through a door at least once in so many metres.
 WIDE, OFTEN = 2.2, 30.0
-# Two doors are one if their middles are nearer than this, in metres.
-SAME = 0.6
+# Two doors, one after the other, are one if their middles are nearer than this, in metres: there is no going in between.
+SAME = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
             passes[-1].append(door)
         else:
             passes.append([door])
-    middles = [np.mean([door.middle for door in same], axis=0) for same in passes]
+    middles = [min(same, key=lambda door: door.width).middle for same in passes]  # where it is narrowest
     return tuple(_visit(track, passes, middles, number) for number in range(len(passes)))
 
 

@@ -27,8 +27,8 @@ RIGHT = 0.85
 AGREE = 0.2
 # How far the middle of a place and the direction of a way are off at one visit, by another: standard deviations in metres and radians.
 MIDDLE, DIRECTION = 0.4, 0.1
-# The same of the middle of a door.
-THRESHOLD = 0.1
+# The same of the middle of a door, which is told more exactly, and of the straight way from one door to the next.
+THRESHOLD, ACROSS = 0.05, 0.05
 # Besides what matching scans says of itself, each displacement may be off by so much: standard deviations in metres and radians.
 FLOOR = (0.02, 0.02, 0.002)
 # What repeats in a track of matched scans: how far the scale of the odometer is off, as a share, and how the heading drifts, in radians a metre.
@@ -78,7 +78,9 @@ def to_trace(log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit],
     return Trace(
         tuple(steps),
         name=name,
-        odometry=Odometry(scale=SCALE, bend=DRIFT, offset=THRESHOLD if scale.doors else MIDDLE, facing=DIRECTION),
+        odometry=Odometry(
+            scale=SCALE, bend=DRIFT, offset=THRESHOLD if scale.doors else MIDDLE, facing=ACROSS if scale.doors else DIRECTION
+        ),
         extra={"beams": {"first": -90, "step": 1}, "right_angles": right},
     )
 
