@@ -31,8 +31,9 @@ DOOR, WIDER, BESIDE = 1.6, 1.33, 2.0
 DEEP = 0.5
 # A building is one of rooms if most of the way is wider than this, in metres, and the robot drives through a door at least once in so many metres.
 WIDE, OFTEN = 2.2, 30.0
-# Two doors, one after the other, are one if their middles are nearer than this, in metres: there is no going in between.
-SAME = 1.0
+# Two doors, one after the other, are one if their middles are nearer than this, in metres; and a narrow part within so many metres of a door that the robot came out of again right after it
+# is a part of that door.
+SAME, WITHIN = 0.6, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +110,12 @@ def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
     for door in doors:
         if passes and math.dist(door.middle, passes[-1][-1].middle) < SAME:
             passes[-1].append(door)
+        elif (
+            len(passes) > 1
+            and math.dist(door.middle, passes[-2][-1].middle) < SAME
+            and math.dist(door.middle, passes[-1][-1].middle) < WITHIN
+        ):
+            passes[-2] += [*passes.pop(), door]
         else:
             passes.append([door])
     middles = [min(same, key=lambda door: door.width).middle for same in passes]  # where it is narrowest
