@@ -377,6 +377,7 @@ def test_a_bag_says_what_its_odometry_is_worth(tmp_path: Path) -> None:
         (["school.xml", "--as", "carmen", "--reach", "1"], "--reach: expected none beside a floor plan"),
         (["triangle", "--as", "carmen", "--no-stars"], "--no-stars: expected none beside --as"),
         (["triangle", "--as", "carmen", "--images", "panoramas"], "--images panoramas: expected none beside --as"),
+        (["triangle", "--as", "carmen", "--hours", "7,19"], "--hours: expected none beside --as"),
         (["triangle", "--as", "carmen", "--every", "0"], "every: expected metres, 0.01 or more, got 0"),
         (["triangle", "--as", "carmen", "--odometry-noise", "nan"], "--odometry-noise: expected a number from 0 to 1, got nan"),
     ],

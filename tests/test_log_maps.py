@@ -110,6 +110,9 @@ def test_a_log_of_a_robot_that_stands_or_passes_nothing_is_an_error() -> None:
     still = [Scan(corridor, laser, (0.0, 0.0, 0.0))] * 3
     with pytest.raises(LogError, match="expected a robot that drives"):
         import_log(RobotLog(tuple(still), source="still.log"))
+    blind = [replace(scan, ranges=np.full(181, value)) for scan, value in zip(still, (0.0, 30.0, np.nan), strict=True)]
+    with pytest.raises(LogError, match="expected scans that meet walls, got 3 in which no beam meets anything"):
+        import_log(RobotLog(tuple(blind), source="blind.log"))
     onward = [Scan(np.where(corridor >= 30, np.inf, corridor), laser, (0.5 * i, 0.0, 0.0)) for i in range(30)]
     with pytest.raises(LogError, match="expected a way past junctions, corners or dead ends"):
         import_log(RobotLog(tuple(onward), source="corridor.log"))

@@ -60,6 +60,10 @@ def import_log(
     Raises LogError where the robot passed no distinctive place, or hardly moved.
     """
     seconds: dict[str, float] = {}
+    if not any(((scan.ranges > 0) & (scan.ranges < scan.laser.reach)).any() for scan in log.scans):
+        raise LogError(
+            f"{named(log.source)}: expected scans that meet walls, got {len(log)} in which no beam meets anything; look at the laser"
+        )
     with _timed(seconds, "track"):
         track = follow(log)
     if track.way[-1] < 1.0:

@@ -109,6 +109,9 @@ def _drive(options: argparse.Namespace) -> Drive:
 
     for name, given in (
         ("--images panoramas", options.images != "ranges"),
+        ("--textures", options.textures is not None),
+        ("--paint-seed", options.paint_seed is not None),
+        ("--hours", options.hours is not None),
         ("--no-stars", options.no_stars),
         ("-o -", options.output == "-"),
     ):
