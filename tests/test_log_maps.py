@@ -15,6 +15,7 @@ import pytest
 from test_plans import DOORS, MIDDLES, plan_of, xml
 
 from perception.errors import LogError
+from perception.places.doors import Door, visits_of
 from perception.places.importing import Imported, import_log
 from perception.places.local_map import CELL, distances
 from perception.places.scale import Scale
@@ -244,6 +245,29 @@ def test_the_building_of_the_paper_comes_out_of_its_raw_log() -> None:
     ]
     assert at == ["NC", "NE", "ME", "SE", "SC", "SW", "MW", "NW", "NC", "MC", "SC", "MC", "MW", "MC", "ME"]
     assert (done.solution.count, done.solution.cost.places, done.solution.cost.paths) == (1, 9, 6)
+
+
+@pytest.mark.parametrize(
+    ("middles", "expected"),
+    [
+        ([], []),
+        ([0.0], [0.0]),
+        ([0.0, 5.0, 9.0], [0.0, 5.0, 9.0]),
+        ([0.0, 5.0, 5.2, 9.0], [0.0, 5.0, 9.0]),  # in and out by one door
+        ([5.0, 5.8, 5.0], [5.0]),  # a narrow part behind the first door of a log
+        ([0.0, 5.0, 5.8, 5.1, 9.0], [0.0, 5.0, 9.0]),  # and behind another one
+        ([0.0, 5.0, 6.2, 5.1, 9.0], [0.0, 5.0, 6.2, 5.1, 9.0]),  # another door, a little farther behind it
+    ],
+)
+def test_passes_through_one_door_in_a_row_are_one_visit(middles: list[float], expected: list[float]) -> None:
+    """The doors are in a line, each wider than the one before it, so that the first of those that are one door says where its middle is."""
+    track = Track(np.array([(x, 0.0, 0.0) for x in range(20)], dtype=float), np.zeros((20, 3, 3)))
+    doors = [Door(2 * k + 1, np.array([x, 0.0]), 1.0 + k / 100, 2.0 * k) for k, x in enumerate(middles)]
+    visits = visits_of(track, doors)
+    assert [float(visit.middle[0]) for visit in visits] == expected
+    assert all(before.end <= after.begin for before, after in itertools.pairwise(visits))
+    assert [visit.arrived is None for visit in visits] == [k == 0 for k in range(len(visits))]
+    assert [visit.left is None for visit in visits] == [k == len(visits) - 1 for k in range(len(visits))]
 
 
 def test_where_a_building_has_rooms_its_doors_are_the_places(tmp_path: Path) -> None:

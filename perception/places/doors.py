@@ -115,7 +115,8 @@ def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
             and math.dist(door.middle, passes[-2][-1].middle) < SAME
             and math.dist(door.middle, passes[-1][-1].middle) < WITHIN
         ):
-            passes[-2] += [*passes.pop(), door]
+            part = passes.pop()
+            passes[-1] += [*part, door]
         else:
             passes.append([door])
     middles = [min(same, key=lambda door: door.width).middle for same in passes]  # where it is narrowest
