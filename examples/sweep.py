@@ -32,7 +32,7 @@ Row = dict[str, Any]
 # What is solved for each drive and theory; None where the drive could not be mapped.
 RUNGS = ("maps", "views", "+ star", "+ pairs", "+ geometry", "+ planarity", None)
 INTERRUPTED = 130  # the exit code after Ctrl-C
-# What each theory is asked with. Where none is named, it is the one that suits the walls of the building, with what is said laid over it.
+# What each theory is asked with. Where none is named, it is the one that suits the building, with what is said laid over it.
 THEORIES = {
     "as it suits": [],
     "stars and sides": ["--theory", "topological"],

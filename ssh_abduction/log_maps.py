@@ -1,7 +1,8 @@
 """From a robot's log to the minimal maps of the building, and to a folder that tells the whole run.
 
 A building whose walls meet at right angles is mapped by the topological theory with stars. Elsewhere stars are too often misread, and what lies right of a path that bends is not to be said: there
-displacements tell places apart, and no sides are asked for. The same goes for a building whose stars no map fits, as a junction was passed unnoticed, or one star misread.
+displacements tell places apart, and no sides are asked for. The same goes where doors are the places, as a path may lead across a room in any direction. And it goes
+for a building whose stars no map fits, as a junction was passed unnoticed, or one star misread.
 """
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ class LogMap:
 
 
 def theory_for(imported: Imported) -> Theory:
-    """The theory that suits the walls of a building."""
+    """The theory that suits a building: with stars and sides where its places are junctions and its walls meet at right angles, else BARE."""
     return Theory.topological() if imported.trace.extra["right_angles"] else BARE
 
 

@@ -172,7 +172,7 @@ def _settings(run: Mapping[str, Any]) -> str:
     theory = ", ".join(f"{name} {value}" for name, value in run["theory"].items() if value not in (None, False, [], 0))
     rows = (
         [
-            ("places", "doors", "between rooms that are wide, as the widths of the robot's way suggest; a path leads across a room"),
+            ("places", "doors", "those that the robot drove through; a path leads across a room"),
             ("theory", theory, "the axioms, and the choices in them"),
         ]
         if run["scale"]["doors"]

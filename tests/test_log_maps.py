@@ -270,6 +270,12 @@ def test_passes_through_one_door_in_a_row_are_one_visit(middles: list[float], ex
     assert [visit.left is None for visit in visits] == [k == len(visits) - 1 for k in range(len(visits))]
 
 
+@pytest.mark.parametrize("command", [["import"], ["map"]])
+def test_doors_have_no_scale(hall: Path, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*command, str(hall), "-o", str(hall.with_name("none")), "--places", "doors", "--radius", "5"]) == 1
+    assert "--radius: expected none with --places doors, got 5" in capsys.readouterr().err
+
+
 def test_where_a_building_has_rooms_its_doors_are_the_places(tmp_path: Path) -> None:
     """A robot drives around four rooms in a ring."""
     middles = {room: middle for room, middle in MIDDLES.items() if room != "closet"}
@@ -285,3 +291,5 @@ def test_where_a_building_has_rooms_its_doors_are_the_places(tmp_path: Path) -> 
     no_doors = RobotLog(done.log.scans[: done.imported.visits[0].begin - 5], source="room")
     with pytest.raises(LogError, match=r"expected a way through doors, .*--places junctions"):
         import_log(no_doors, doors=True)
+    begin = RobotLog(done.log.scans[: done.imported.visits[1].end + 20], source="begin")
+    assert import_log(begin).scale.doors and not import_log(begin, gateway=0.8).scale.doors  # a scale is one of junctions

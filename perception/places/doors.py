@@ -99,9 +99,9 @@ def is_wide(scale: Scale) -> bool:
     return scale.most > WIDE
 
 
-def has_rooms(scale: Scale, doors: Sequence[Door], track: Track) -> bool:
-    """Whether the building is one of rooms, and not of corridors: most of it is wide, and the robot drives through doors again and again."""
-    return is_wide(scale) and len(doors) * OFTEN > track.way[-1]
+def are_frequent(doors: Sequence[Door], track: Track) -> bool:
+    """Whether the robot drives through doors again and again, as it does in a building of rooms."""
+    return bool(len(doors) * OFTEN > track.way[-1])
 
 
 def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:

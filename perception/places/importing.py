@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perception.errors import ImageWarning, LogError
-from perception.places.doors import find_doors, has_rooms, is_wide, visits_of
+from perception.places.doors import are_frequent, find_doors, is_wide, visits_of
 from perception.places.scale import Scale, suggested
 from perception.places.tracing import to_trace
 from perception.places.track import Track, follow
@@ -55,11 +55,14 @@ def import_log(
 
     gateway, radius  metres, as in Scale; what the log itself suggests, where they are None
     name             of the trace
-    doors            whether the doors that the robot drives through are the places, rather than where ways part or bend; as the log itself suggests, where it is None
+    doors            whether the doors that the robot drives through are the places, rather than where ways part or bend. Where it is None, the log itself suggests it;
+                     but no doors are asked for where gateway or radius is given, as these are about ways that part
 
     Raises LogError where the robot passed no distinctive place, or hardly moved.
     """
     seconds: dict[str, float] = {}
+    if doors is None and (gateway is not None or radius is not None):
+        doors = False
     if not any(((scan.ranges > 0) & (scan.ranges < scan.laser.reach)).any() for scan in log.scans):
         raise LogError(
             f"{named(log.source)}: expected scans that meet walls, got {len(log)} in which no beam meets anything; look at the laser"
@@ -72,8 +75,8 @@ def import_log(
         found = suggested(log.scans, track)
         scale = replace(found, gateway=found.gateway if gateway is None else gateway, radius=found.radius if radius is None else radius)
     with _timed(seconds, "places"):
-        passed = find_doors(log, track) if (is_wide(scale) if doors is None else doors) else ()
-        scale = replace(scale, doors=bool(has_rooms(scale, passed, track) if doors is None else doors))
+        passed = find_doors(log, track) if doors or (doors is None and is_wide(scale)) else ()
+        scale = replace(scale, doors=are_frequent(passed, track) if doors is None else doors)
         visits = visits_of(track, passed) if scale.doors else find_visits(log, track, scale)
     if not visits and scale.doors:
         raise LogError(

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from perception.places.gateways import MERGED, Outlook, apart, nearest, outlook, parting
-from perception.places.local_map import CELL, LocalMaps, Patch
+from perception.places.local_map import CELL, Bools, Cell, LocalMaps, Patch
 from perception.places.scale import EVERY, Scale, milestones
 from perception.places.track import Array, Track, surfaces
 from perception.readers.scans import RobotLog
@@ -92,8 +92,7 @@ def find_visits(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
 def _vote(maps: LocalMaps, track: Track, scale: Scale, i: int) -> _Vote | None:
     """The place that can be told from a milestone, if there is one."""
     patch = maps.around(i, track.poses[i, :2], scale.half)
-    open_cells = patch.drivable(scale.gateway)
-    here = nearest(open_cells, patch.cell(track.poses[i, :2]), ASTRAY)
+    open_cells, here = _start(patch, track.poses[i, :2], scale.gateway)
     if here is None:
         return None
     seen = outlook(open_cells, here, scale.radius)
@@ -245,9 +244,14 @@ def _ways(patch: Patch, middle: Array, scale: Scale) -> list[Way]:
     return ways
 
 
-def _outlook(patch: Patch, middle: Array, width: float, radius: float) -> Outlook | None:
+def _start(patch: Patch, position: Array, width: float) -> tuple[Bools, Cell | None]:
+    """The cells in which something of this width can drive, and the one of them that is nearest to a position; None where all are farther than ASTRAY."""
     open_cells = patch.drivable(width)
-    here = nearest(open_cells, patch.cell(middle), ASTRAY)
+    return open_cells, nearest(open_cells, patch.cell(position), ASTRAY)
+
+
+def _outlook(patch: Patch, middle: Array, width: float, radius: float) -> Outlook | None:
+    open_cells, here = _start(patch, middle, width)
     return None if here is None else outlook(open_cells, here, radius)
 
 

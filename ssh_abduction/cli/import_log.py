@@ -44,7 +44,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     scale.add_argument(
         "--places",
         choices=PLACES,
-        help="what the places are: where ways part or bend (junctions), or the doors between rooms (doors) (default: doors in a building that has rooms and no corridors)",
+        help="what the places are: where ways part or bend (junctions), or the doors that the robot drives through (doors) (default: doors where most of its way is wide and leads through doors often, and neither --gateway nor --radius is given; else junctions)",
     )
     scale.add_argument("--radius", type=metres, metavar="M", help="how far a way out must lead from the middle of a place, in metres")
 
@@ -75,9 +75,10 @@ def run(options: argparse.Namespace) -> int:
         raise SSHError("-: expected the file of a log, got standard input; save it to a file")
     if options.output != "-" and not Path(options.output).absolute().parent.is_dir():
         raise SSHError(f"{named(options.output)}: cannot write the trace: its folder is not there; make it first")
+    doors = doors_of(options)
     log = read(options.log, options)
     warn([*log.notes, *damage(log)])
-    done = import_log(log, options.gateway, options.radius, named_after(options.log), doors_of(options))
+    done = import_log(log, options.gateway, options.radius, named_after(options.log), doors)
     scale = done.scale
     places = "doors" if scale.doors else f"distinctive places at a radius of {scale.radius:g} m, gateways from {scale.gateway:g} m"
     said = f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: {counted(len(done.visits), 'visits')} to {places}; {counted(len(done.trace), 'steps')}"
@@ -86,10 +87,16 @@ def run(options: argparse.Namespace) -> int:
 
 
 def doors_of(options: argparse.Namespace) -> bool | None:
-    """Whether doors are the places, as asked; None where the log is to tell. A scale that is given is one of junctions."""
-    if options.places is None and (options.gateway or options.radius):
-        return False
-    return None if options.places is None else bool(options.places == "doors")
+    """Whether doors are the places, as asked; None where the log is to tell. Raises SSHError for a scale of junctions where doors are asked for."""
+    if options.places is None:
+        return None
+    doors = bool(options.places == "doors")
+    for name, given in (("--gateway", options.gateway), ("--radius", options.radius)):
+        if doors and given is not None:
+            raise SSHError(
+                f"{name}: expected none with --places doors, got {given:g}; it is about ways that part, so leave it out, or ask for junctions"
+            )
+    return doors
 
 
 def named_after(path: str) -> str:

@@ -33,7 +33,10 @@ def add_parser(verbs: Verbs) -> None:
     many.add_argument("--jobs", type=int, metavar="N", help="map N logs at a time, each in a process; -1 for one a core (default: 1)")
     many.add_argument("--scheduler", metavar="ADDRESS", help="map on the workers of the Dask scheduler at this address, tcp://host:port")
     add_reading(parser)
-    add_theory(parser, default="topological; where walls do not meet at right angles, without stars and sides")
+    add_theory(
+        parser,
+        default="topological; without stars and sides where doors are the places, where walls do not meet at right angles, and where no map fits the stars",
+    )
     parser.set_defaults(run=run)
 
 
