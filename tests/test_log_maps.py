@@ -292,4 +292,5 @@ def test_where_a_building_has_rooms_its_doors_are_the_places(tmp_path: Path) -> 
     with pytest.raises(LogError, match=r"expected a way through doors, .*--places junctions"):
         import_log(no_doors, doors=True)
     begin = RobotLog(done.log.scans[: done.imported.visits[1].end + 20], source="begin")
-    assert import_log(begin).scale.doors and not import_log(begin, gateway=0.8).scale.doors  # a scale is one of junctions
+    assert import_log(begin).scale.doors
+    assert not import_log(begin, gateway=0.8).scale.doors  # a scale is one of junctions

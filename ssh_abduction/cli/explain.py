@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _theory_in(file: str) -> Theory:
     """The theory that a file of maps was made with. Raises MapError."""
-    data = read_maps(file)
+    data = read_maps(file, mend="name the maps that were made of it")
     if not isinstance(data, dict) or "theory" not in data:
         raise MapError(f"{named(file)}: theory: expected the theory that the maps were made with, got none; name it with --theory")
     return theory_in(data["theory"], named(file))

@@ -93,14 +93,17 @@ def check_number(number: int | None, maps: Sequence[object], where: str) -> None
         raise MapError(f"{where}: --map: expected 1 to {len(maps)}, got {number}" if maps else f"{where}: --map: expected a map, got none")
 
 
-def read_maps(file: str) -> Any:
-    """The JSON in a file of maps, of a verb that takes the maps first and then a trace. Raises MapError."""
+def read_maps(file: str, mend: str = "name the maps first, and then the trace") -> Any:
+    """The JSON in a file of maps. Raises MapError.
+
+    mend  how it is mended if a trace is named instead; else as for a verb that takes the maps first
+    """
     try:
         return read_json(file)
     except MapError:
         if file == "-" or not _is_trace(file):
             raise
-        raise MapError(f"{named(file)}: expected a file of maps, got a trace; name the maps first, and then the trace") from None
+        raise MapError(f"{named(file)}: expected a file of maps, got a trace; {mend}") from None
 
 
 def _is_trace(file: str) -> bool:
