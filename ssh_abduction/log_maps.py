@@ -153,7 +153,7 @@ def map_log(
 ) -> LogMap:
     """The minimal maps of a building, from a robot's log.
 
-    theory           the axioms; `theory_for` chooses, where it is None, and another time if no map satisfies these
+    theory           the axioms. Where it is None, `theory_for` chooses, and if no map satisfies what it chose, the log is mapped again by BARE
     choices          fields of Theory, laid over that: a choice about one thing leaves the others as they suit the log
     gateway, radius  metres, as in perception.places.scale.Scale; what the log suggests, where they are None
     doors            whether doors are the places, as in perception.places.importing.import_log; what the log suggests, where it is None

@@ -53,9 +53,10 @@ class Door:
 
 
 def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
-    """The doors that the robot drove through, in order, once for each time."""
+    """The doors that the robot drove through, in order. One that it drove through twice is there twice."""
     maps = LocalMaps(log.scans, track, 2 * ASIDE)
     ways = np.arange(0.0, track.way[-1], STRIDE)
+    # While the robot stands, its way does not grow: only the first of such scans is a point to interpolate between.
     moving = np.concatenate([[True], np.diff(track.way) > 0])
     positions = np.stack([np.interp(ways, track.way[moving], track.poses[moving, k]) for k in (0, 1)], axis=1)
     scans = np.searchsorted(track.way, ways, side="right") - 1
@@ -70,6 +71,7 @@ def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
         gaps += [_gap(occupied, patch, at, angle) for at, angle in zip(positions[some], across[some], strict=True)]
     widths = np.array([width for width, _ in gaps])
     found: list[Door] = []
+    # The narrowest look comes first, so that each door is taken where it is narrowest, and what is found beside it later is the same door.
     for k in np.argsort(widths, kind="stable"):
         if widths[k] > DOOR:
             break

@@ -758,7 +758,7 @@ def paths_frameless_facts(
 ) -> str:
     """Dstates, the numbered actions that link them, and what is preferred, as facts for paths_frameless.lp.
 
-    far     pairs of dstates of which, as evidence says, one or more are not at one place: mostly a single pair
+    far     sets of pairs of dstates: evidence says that in each set there is a pair that is not at one place. Most sets are a single pair
     single  ask only for places and paths in which no two places and no two segments are one, unless they have to be
     """
     facts = [sides_framed_facts(theory), *(["total."] if theory.path_order == "total" else []), *(["single."] if single else [])]

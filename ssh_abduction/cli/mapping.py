@@ -97,7 +97,7 @@ class MapQuestion:
             return self.failed(number, path, error)
 
     def _mapped(self, number: int, path: str, here: str, content: str | None) -> MapAnswer:
-        """Map the log that is here, and whose content has this digest, which is made first: if the log changes meanwhile, it is mapped again some day."""
+        """Map the log in the file `here`. The digest of its content was made before: if the log changes meanwhile, the next call sees another digest, and maps it again."""
         from perception.readers.logs import read_log
         from ssh_abduction.log_maps import map_log
 

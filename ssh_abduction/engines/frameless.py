@@ -54,10 +54,10 @@ PARTS, EACH = ("base", "least", "paths"), ("each",)
 
 @dataclass(frozen=True)
 class _Far:
-    """Pairs of dstates of which one or more are not at one place, mostly a single pair.
+    """A set of pairs of dstates, mostly a single pair, in which there is a pair that is not at one place.
 
     pairs   of dstates
-    placed  steps, each with the dstate that it is at, of which evidence says so
+    placed  the steps that evidence says so of, each with the dstate that it is at
     """
 
     pairs: tuple[tuple[int, int], ...]
@@ -65,7 +65,7 @@ class _Far:
 
     @classmethod
     def of(cls, labels: Sequence[int], equalities: Collection[Equality]) -> _Far | None:
-        """What it says of labels that equalities do not all hold; None where some do not hold anyway, as their steps are not one dstate."""
+        """What follows for these labels if equalities do not all hold; None where nothing follows, as some steps that were to be one dstate are not."""
         steps = dict.fromkeys(step for equality in equalities for step in (equality.first, equality.second))
         if max(steps) >= len(labels) or any(e.of == "dstate" and labels[e.first] != labels[e.second] for e in equalities):
             return None

@@ -26,7 +26,9 @@ _log = log_of(__name__)
 
 FIRST_PREFIX = 8  # The first prefix has so many steps: solving it costs next to nothing.
 HELD_BACK = 1000  # So many maps are kept until a prefix proves long enough; from there on they stream, so that memory stays constant.
-REMEMBERED = 10_000  # So many maps are remembered where all are asked for and evidence may refuse some: until then what is refused is forbidden while maps are listed.
+# Where all maps are asked for and evidence may refuse some, so many are remembered. Until then what is refused is forbidden, and maps are listed anew;
+# from there on refused maps are left out one by one.
+REMEMBERED = 10_000
 FIRST_PATHS = (
     8  # So many names for paths there are to begin with: few traces need more, and grounding grows with the square of their number.
 )
@@ -180,12 +182,13 @@ class Prefixes:
                 whole = self._whole(found.map, replayed)
                 if whole in given or any(self._replay(found.map, size).outcome is Outcome.PREDICTED for size in streamed):
                     continue
+                remembers = self._judging.may_refuse and (asked or len(given) < REMEMBERED)
                 if self._judging.why_refused(whole):
-                    refusal = self._judging.why_refused(found.map) if telling and (asked or len(given) < REMEMBERED) else None
+                    refusal = self._judging.why_refused(found.map) if telling and remembers else None
                     if refusal:
                         break
                     continue
-                if self._judging.may_refuse and (asked or len(given) < REMEMBERED):
+                if remembers:
                     given.add(whole)
                 if streaming:
                     yield whole
