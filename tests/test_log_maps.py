@@ -221,6 +221,13 @@ def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.Captur
     (other / "trace.jsonl").write_text("")
     assert main(["compare", str(folder), str(other)]) == 0
     assert "scale.radius: " in capsys.readouterr().out
+    assert main(["compare", str(folder), str(other), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told == {"runs": {"scale.radius": [pytest.approx(5.6, abs=1), 9.0]}}  # and no more, as their traces differ
+    assert main(["compare", str(folder), str(folder), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["runs"] == {}
+    assert told["count"] == len(told["others"]["both"])
 
 
 def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_alone(hall: Path, tmp_path: Path) -> None:

@@ -42,10 +42,15 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.rivals.listing import Listing
 
     maps, others = within(options.maps), within(options.other) if options.other is not None else None
+    told: dict[str, Any] = {}  # what --json prints
     if maps != options.maps and others != options.other:
-        print("\n".join(differences(options.maps, options.other)))
-        if not of_one_trace(options.maps, options.other):
-            return 0  # maps of different traces cannot be compared any further
+        told["runs"] = differences(options.maps, options.other)
+        if not options.json:
+            print("\n".join(_runs(told["runs"], options.maps, options.other)))
+        if not of_one_trace(options.maps, options.other):  # maps of different traces cannot be compared any further
+            if options.json:
+                print(json_line(told))
+            return 0
     listing = Listing.load(maps)
     other = Listing.load(others) if others is not None else None
     if options.diff:
@@ -53,11 +58,11 @@ def run(options: argparse.Namespace) -> int:
         listing.check_same_trace(there)
         i, j = listing.number(options.diff[0]), there.number(options.diff[1])
         names = f"map {i + 1}", f"map {j + 1}" + (f" of {printable(other.source)}" if other else "")
-        told = difference(listing.maps[i], there.maps[j], names)
-        print(json_line(told.to_dict()) if options.json else told)
+        between = difference(listing.maps[i], there.maps[j], names)
+        print(json_line({**told, **between.to_dict()}) if options.json else between)
         return 0
     found = compare(listing, other)
-    print(json_line(found.to_dict()) if options.json else "\n".join(_lines(found)))
+    print(json_line({**told, **found.to_dict()}) if options.json else "\n".join(_lines(found)))
     return 0
 
 
@@ -66,11 +71,16 @@ def within(name: str) -> str:
     return str(Path(name) / "maps.json") if (Path(name) / "run.json").is_file() else name
 
 
-def differences(first: str, other: str) -> Iterator[str]:
-    """What two runs of `map` differ in, a line for each setting and each figure."""
+def differences(first: str, other: str) -> dict[str, tuple[Any, Any]]:
+    """What two runs of `map` differ in: each setting and each figure by its name, as it is in the first run, and in the other one."""
     here, there = (_flat(read_json(Path(folder) / "run.json")) for folder in (first, other))
-    differing = [name for name in {**here, **there} if here.get(name) != there.get(name) and not name.startswith(UNSTEADY)]
-    yield from (f"{name}: {brief(here.get(name))} in {named(first)}, {brief(there.get(name))} in {named(other)}" for name in differing)
+    names = {**here, **there}
+    return {name: (a, b) for name in names if (a := here.get(name)) != (b := there.get(name)) and not name.startswith(UNSTEADY)}
+
+
+def _runs(differing: dict[str, tuple[Any, Any]], first: str, other: str) -> Iterator[str]:
+    """A line for each setting and each figure in which two runs differ."""
+    yield from (f"{name}: {brief(a)} in {named(first)}, {brief(b)} in {named(other)}" for name, (a, b) in differing.items())
     if not differing:
         yield "the two runs have the same settings, and found the same"
 
