@@ -72,13 +72,20 @@ def traces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture(scope="module")
-def scheduler() -> Iterator[str]:
-    """The address of a Dask scheduler with one worker of one thread, in a process of its own."""
+def cluster() -> Iterator[str]:
+    """The address of a Dask scheduler with one worker of one thread, in a process of its own, which may take long to come back where the machine is busy."""
     with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        dask.config.set({"distributed.scheduler.allowed-failures": 0, "distributed.deploy.lost-worker-timeout": "600s"}),
         LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
     ):
         yield cluster.scheduler_address
+
+
+@pytest.fixture
+def scheduler(cluster: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The same, for who waits as long as it takes."""
+    monkeypatch.setattr(batch, "PATIENCE", 600)
+    return cluster
 
 
 def without_seconds(text: str) -> str:
