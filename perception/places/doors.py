@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
-from perception.places.local_map import CELL, Bools, LocalMaps, Patch
+from perception.places.local_map import LocalMaps, Patch
 from perception.places.scale import Scale
 from perception.places.track import Array, Track
 from perception.places.visits import Visit, Way
@@ -67,8 +66,7 @@ def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
         some = slice(begin, begin + LOOKS)
         middle = begin + len(positions[some]) // 2
         patch = maps.around(int(scans[middle]), positions[middle], ASIDE + 1)
-        occupied = ndimage.binary_dilation(patch.occupied, np.ones((2, 2), bool))
-        gaps += [_gap(occupied, patch, at, angle) for at, angle in zip(positions[some], across[some], strict=True)]
+        gaps += [_gap(patch, at, angle) for at, angle in zip(positions[some], across[some], strict=True)]
     widths = np.array([width for width, _ in gaps])
     found: list[Door] = []
     # The narrowest look comes first, so that each door is taken where it is narrowest, and what is found beside it later is the same door.
@@ -84,14 +82,10 @@ def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
     return tuple(sorted(found, key=lambda door: door.way))
 
 
-def _gap(occupied: Bools, patch: Patch, at: Array, across: float) -> tuple[float, Array]:
+def _gap(patch: Patch, at: Array, across: float) -> tuple[float, Array]:
     """The least width of the free space across a way, in metres, and the middle of that."""
-    far = np.arange(0.0, ASIDE, CELL / 2)
     directions = np.stack([np.cos(across + ASKEW), np.sin(across + ASKEW)], axis=1)
-    sides = np.stack([directions, -directions], axis=1)
-    cells = np.rint((at + far[:, None] * sides[:, :, None, :] - patch.corner) / CELL).astype(int)
-    hit = occupied[cells[..., 0], cells[..., 1]]
-    free = np.where(hit.any(axis=2), far[hit.argmax(axis=2)], ASIDE)
+    free = patch.free_along(at, np.stack([directions, -directions], axis=1), ASIDE)
     k = int(free.sum(axis=1).argmin())
     return float(free[k].sum()), at + (free[k, 0] - free[k, 1]) / 2 * directions[k]
 

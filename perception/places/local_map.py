@@ -60,6 +60,18 @@ class Patch:
         """Metres from each cell to the nearest one that something is in."""
         return np.asarray(ndimage.distance_transform_edt(~self.occupied)) * CELL
 
+    @cached_property
+    def _met(self) -> Bools:
+        """Where a look that passes through a cell meets something: in the cell itself, or in one of the next ones."""
+        return np.asarray(ndimage.binary_dilation(self.occupied, np.ones((2, 2), bool)))
+
+    def free_along(self, begin: Array, directions: Array, most: float) -> Array:
+        """Metres that one can look from a position before something is met, and no more than `most`: one number for each direction, of unit vectors (..., 2)."""
+        far = np.arange(0.0, most, CELL / 2)
+        cells = np.rint((begin + far[:, None] * directions[..., None, :] - self.corner) / CELL).astype(int)
+        met = self._met[cells[..., 0], cells[..., 1]]
+        return np.where(met.any(axis=-1), far[met.argmax(axis=-1)], most)
+
     def drivable(self, width: float) -> Bools:
         """Where something of this width in metres can go. Where the robot went is always one of these cells."""
         return np.asarray((self.clearance >= width / 2) | ndimage.binary_dilation(self.trail, _EIGHT, iterations=2))

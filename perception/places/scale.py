@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perception.places.local_map import CELL, LocalMaps, Patch
-from perception.places.track import Array, Track
+from perception.places.local_map import LocalMaps
+from perception.places.track import Track
 from perception.readers.scans import Scan
 
 # Passages are measured once in so many metres.
@@ -66,7 +66,7 @@ def suggested(scans: Sequence[Scan], track: Track) -> Scale:
         if (length := math.hypot(*ahead)) > 0.2:
             patch = maps.around(i, track.poses[i, :2], ASIDE + 1)
             left = np.array([-ahead[1], ahead[0]]) / length
-            widths.append(_free_along(patch, track.poses[i, :2], left) + _free_along(patch, track.poses[i, :2], -left))
+            widths.append(float(patch.free_along(track.poses[i, :2], np.stack([left, -left]), ASIDE).sum()))
     narrow, corridor, most = np.percentile(widths, [NARROW, CORRIDOR, MOST]) if widths else (1.2, 1.7, 1.7)
     return Scale(
         gateway=round(float(np.clip(SHARE * narrow, 0.5, 2.0)), 2),
@@ -82,12 +82,3 @@ def milestones(track: Track, every: float) -> list[int]:
         if way - track.way[kept[-1]] >= every:
             kept.append(i)
     return kept
-
-
-def _free_along(patch: Patch, begin: Array, direction: Array) -> float:
-    """Metres that one can look in a direction before something is met, at most ASIDE."""
-    for far in np.arange(0.0, ASIDE, CELL / 2):
-        row, column = patch.cell(begin + far * direction)
-        if patch.occupied[row : row + 2, column : column + 2].any():
-            return float(far)
-    return ASIDE

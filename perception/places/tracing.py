@@ -54,9 +54,10 @@ def has_right_angles(visits: Sequence[Visit]) -> bool:
 
 def to_trace(log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit], name: str | None = None) -> Trace:
     """The trace of a log: steps with images, stars and displacements, and the actions between them. Views are left to cluster."""
-    right = not scale.doors and has_right_angles(visits)
-    if not scale.doors:
-        visits = _aligned(visits, QUARTER if right else QUARTER / 2)
+    # Ways are turned by multiples of the stride, an angle in radians; from door to door they lead in any direction.
+    stride = None if scale.doors else QUARTER if has_right_angles(visits) else QUARTER / 2
+    if stride is not None:
+        visits = _aligned(visits, stride)
     maps = LocalMaps(log.scans, track, scale.window)
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
@@ -66,22 +67,22 @@ def to_trace(log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit],
         went = None if visit.left is None else visit.ways[visit.left].bearing
         # The only visit of a log that neither came from anywhere nor went on faces as the robot did.
         headings = [heading for heading in (came, went) if heading is not None] or [float(track.poses[visit.scan, 2])]
-        if len(headings) == 2 and apart(*headings) < AHEAD and not scale.doors:
+        if len(headings) == 2 and apart(*headings) < AHEAD and stride is not None:
             headings = headings[:1]
         for heading in headings:
             pose = (float(visit.middle[0]), float(visit.middle[1]), heading)
-            steps.append(_step(log, track, visit, pose, patch, last, right, scale.doors, number))
+            steps.append(_step(log, track, visit, pose, patch, last, stride, number))
             last = (visit, pose)
         if steps and number < len(visits) - 1:
             steps[-1] = replace(steps[-1], action=Action.of("travel"))
-    steps = _with_turns(steps, None if scale.doors else QUARTER if right else QUARTER / 2, visits)
+    steps = _with_turns(steps, stride, visits)
     return Trace(
         tuple(steps),
         name=name,
         odometry=Odometry(
             scale=SCALE, bend=DRIFT, offset=THRESHOLD if scale.doors else MIDDLE, facing=ACROSS if scale.doors else DIRECTION
         ),
-        extra={"beams": {"first": -90, "step": 1}, "right_angles": right},
+        extra={"beams": {"first": -90, "step": 1}, "right_angles": stride == QUARTER},
     )
 
 
@@ -92,8 +93,7 @@ def _step(
     pose: Pose,
     patch: Patch,
     last: tuple[Visit, Pose] | None,
-    right: bool,
-    doors: bool,
+    stride: float | None,
     number: int,
 ) -> Step:
     onward = covariance = None
@@ -111,7 +111,7 @@ def _step(
         truth = {"pose": [round(x, 4) for x in moved(scan.corrected, seen)]}
     return Step(
         image=tuple(round(float(r), 3) for r in _image(patch, visit.middle, pose[2])),
-        star=None if doors else _star(visit, pose[2], right),
+        star=None if stride is None else _star(visit, pose[2], stride),
         displacement=None if onward is None else (round(onward[0], 4), round(onward[1], 4), round(onward[2], 5)),
         covariance=covariance,
         truth=truth,
@@ -161,10 +161,10 @@ def _pose(track: Track, scan: int) -> Pose:
     return float(x), float(y), float(heading)
 
 
-def _star(visit: Visit, heading: float, right: bool) -> tuple[float | Gateway | None, ...]:
+def _star(visit: Visit, heading: float, stride: float) -> tuple[float | Gateway | None, ...]:
     """The star of a visit, as it is seen with a heading: bearings in degrees, clockwise."""
     seen = [(-math.degrees(wrapped(way.bearing - heading)), way.sure) for way in visit.ways]
-    if right:
+    if stride == QUARTER:
         quarters = {round(bearing / 90) % 4: sure for bearing, sure in seen}
         return tuple((1 if quarters[k] else None) if k in quarters else 0 for k in range(4))
     return tuple(Gateway(round(bearing, 1), SPREAD, open=True if sure else None) for bearing, sure in sorted(seen))
