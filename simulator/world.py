@@ -1,6 +1,6 @@
 """Worlds: walls as segments in metres, clutter that may move between tours, and, where it is known, the truth about dstates.
 
-A world is a JSON file that a user can write (docs/worlds.md), or an occupancy map as ROS has it (PGM + YAML).
+A world is a JSON file that a user can write (docs/worlds.md), or an occupancy map as ROS has it (a YAML file and an image).
 
 >>> from simulator.world import World
 >>> World.named("notched-rectangle").segments.shape[1]
@@ -179,7 +179,7 @@ class World:
 
     @classmethod
     def from_occupancy(cls, path: str | os.PathLike[str]) -> World:
-        """The world whose walls are those of an occupancy map, as ROS stores it: a YAML file with image, resolution, origin and occupied_thresh, and its PGM."""
+        """The world whose walls are those of an occupancy map, as ROS stores it: a YAML file and its image (docs/worlds.md)."""
         name, segments = read_occupancy(Path(path))
         middle = segments.reshape(-1, 2).mean(0)
         return cls(printable(name), segments, start=(float(middle[0]), float(middle[1]), 0.0))

@@ -145,25 +145,6 @@ def test_a_world_from_an_occupancy_map(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("yaml", "pgm", "message"),
-    [
-        ("resolution: 0.1\norigin: [0, 0, 0]\n", b"", "expected image, resolution and origin"),
-        ("image: m.pgm\nresolution: no\norigin: [0, 0, 0]\n", b"", "expected image, resolution and origin"),
-        ("image: m.pgm\nresolution: -1\norigin: [0, 0, 0]\n", b"", "expected a resolution above 0"),
-        ("image: no.pgm\nresolution: 1\norigin: [0, 0, 0]\n", b"", "expected a PGM image"),
-        ("image: m.pgm\nresolution: 1\norigin: [0, 0, 0]\n", b"GIF89a", "expected a PGM image"),
-        ("image: m.pgm\nresolution: 1\norigin: [0, 0, 0]\n", b"P5 9 9 255\nshort", "expected 9 x 9 pixels, got fewer"),
-        ("image: m.pgm\nresolution: 1\norigin: [0, 0, 0]\n", b"P5 2 2 255\n\xff\xff\xff\xff", "without occupied cells"),
-    ],
-)
-def test_bad_occupancy_maps(yaml: str, pgm: bytes, message: str, tmp_path: Path) -> None:
-    (tmp_path / "m.yaml").write_text(yaml)
-    (tmp_path / "m.pgm").write_bytes(pgm)
-    with pytest.raises(SimulatorError, match=message):
-        World.named(str(tmp_path / "m.yaml"))
-
-
-@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"format": "map"}, "format: expected"),
