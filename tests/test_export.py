@@ -17,6 +17,8 @@ from ssh_abduction import MapError, SSHMap, Theory, Trace, export_map, solve
 from ssh_abduction.cli import export as verb
 from ssh_abduction.cli import main
 from ssh_abduction.export import formats
+from ssh_abduction.export.roads import TURN, Road, Roads, Stop
+from ssh_abduction.export.tmap2 import tmap2
 from ssh_abduction.maps import DState
 
 
@@ -47,7 +49,7 @@ def nav2_graph(text: str) -> tuple[dict[int, tuple[float, float]], dict[int, tup
         else:
             assert geometry["type"] in ("LineString", "MultiLineString")
             assert type(properties["cost"]) in (int, float)
-            assert properties["cost"] >= 0
+            assert properties["cost"] > 0, "the planner refuses an edge that costs nothing"
             edges[properties["id"]] = (properties["startid"], properties["endid"], properties["cost"])
     assert nodes
     assert edges
@@ -77,10 +79,121 @@ def checked_tmap2(text: str) -> dict[str, Any]:
         assert all(isinstance(node["pose"]["position"][axis], float) for axis in "xyz")
         for edge in node["edges"]:
             assert edge["node"] in names
-            assert isinstance(edge["action"], str)
             edges.append(edge["edge_id"])
     assert len(set(edges)) == len(edges)
     return data
+
+
+# The actions that one can import from nav2_msgs.action.
+NAV2_ACTIONS = {"NavigateToPose", "NavigateThroughPoses", "FollowWaypoints", "ComputePathToPose", "ComputePathThroughPoses"}
+
+
+def looked_up(node: dict[str, Any], path: str) -> Any:
+    for key in path.split("."):
+        node = node[key]
+    return node
+
+
+def filled(goal: Any, node: dict[str, Any]) -> Any:
+    """A goal in which texts that begin with $ stand for fields of the node that the edge leads to."""
+    if isinstance(goal, dict):
+        return {key: filled(value, node) for key, value in goal.items()}
+    return looked_up(node, goal[1:]) if isinstance(goal, str) and goal.startswith("$") else goal
+
+
+def goals_of_humble(text: str) -> dict[str, tuple[str, dict[str, Any]]]:
+    """For each edge the frame and the pose that LCAS's navigation of ROS 2 Humble drives to. Fails where that would."""
+    data = yaml.safe_load(text)
+    nodes = {entry["node"]["name"]: entry for entry in data["nodes"]}
+    found = {}
+    for entry in data["nodes"]:
+        for edge in entry["node"]["edges"]:
+            assert edge["action"] in NAV2_ACTIONS
+            target = filled(edge["goal"], nodes[edge["node"]])["target_pose"]
+            for part, axes in (("position", "xyz"), ("orientation", "xyzw")):
+                assert all(type(target["pose"][part][axis]) is float for axis in axes), "a message takes floating-point numbers alone"
+            found[edge["edge_id"]] = target["header"]["frame_id"], target["pose"]
+    return found
+
+
+def graph_of_lcas(text: str) -> nx.DiGraph[Any]:
+    """The graph that the later navigation plans on: weights are of properties, and actions are those of the map. Fails where that would."""
+    data = yaml.safe_load(text)
+    for action in data["actions"].values():
+        module, _, name = action["action_type"].rpartition(".")
+        assert (module, name in NAV2_ACTIONS, action["action_server"][0]) == ("nav2_msgs.action", True, "/")
+    graph: nx.DiGraph[Any] = nx.DiGraph()
+    for entry in data["nodes"]:
+        node = entry["node"]
+        graph.add_node(node["name"], x=float(node["pose"]["position"]["x"]), y=float(node["pose"]["position"]["y"]))
+        for edge in node["edges"]:
+            assert edge["action"] in data["actions"]
+            graph.add_edge(node["name"], edge["node"], weight=float(edge["properties"]["weight"]))
+    return graph
+
+
+@pytest.mark.parametrize("level", ["places", "dstates"])
+@pytest.mark.parametrize("has_poses", [True, False])
+def test_lcas_can_drive_a_tmap2(level: str, has_poses: bool, square: SSHMap) -> None:
+    ssh_map = square if has_poses else solve(rectangle(8)).maps[0]
+    text = export_map(ssh_map, "tmap2", level=level, frame="hall")
+    goals, graph = goals_of_humble(text), graph_of_lcas(text)
+    assert len(goals) == graph.number_of_edges()
+    assert {frame for frame, _ in goals.values()} == {"hall"}
+    for start, end, weight in graph.edges(data="weight"):
+        a, b = graph.nodes[start], graph.nodes[end]
+        assert weight == pytest.approx(math.dist((a["x"], a["y"]), (b["x"], b["y"])), abs=1e-3)
+        position = goals[f"{start}_{end}"][1]["position"]
+        assert (position["x"], position["y"]) == (b["x"], b["y"])
+    assert nx.shortest_path(graph, *list(graph)[:2], weight="weight")
+
+
+@pytest.mark.parametrize("heading", [0.0, 8e-6, -8e-6, math.pi, -1e-9, 1e5])
+@pytest.mark.parametrize("x", [0.0, -4e-6, 12345.678949, -0.0, 1e6, 1e20])
+def test_numbers_have_a_decimal_point_and_no_exponent(x: float, heading: float) -> None:
+    stops = (Stop(0, x, -x, heading, ("a",)), Stop(1, 5.0, 0.0, 0.0, ("b",)))
+    text = tmap2(Roads("places", True, stops, (Road(0, 1, math.hypot(5 - x, x), None, None, None),)), "m", "map")
+    assert not re.search(r"\d[eE][-+]?\d", text.replace("place-", ""))
+    (pose,) = (entry["node"]["pose"] for entry in yaml.safe_load(text)["nodes"][:1])
+    assert all(type(value) is float for part in pose.values() for value in part.values())
+    assert pose["position"]["x"] == pytest.approx(x, abs=1e-4)
+    assert pose["orientation"]["w"] == pytest.approx(math.cos(heading / 2), abs=1e-6)
+
+
+def test_a_turn_costs_a_planner_more_than_nothing(square: SSHMap) -> None:
+    nodes, edges = nav2_graph(export_map(square, "nav2", level="dstates"))
+    costs = {nodes[start] == nodes[end]: cost for start, end, cost in edges.values()}
+    assert costs[True] == TURN
+    assert costs[False] == pytest.approx(10, abs=0.2)
+    assert Road(0, 1, 1e-9, None, None, None).cost > 0
+    near = Roads("dstates", True, (Stop(0, 0, 0, 0, ()), Stop(1, 1e-9, 0, 0, ()), Stop(2, 3, 0, 0, ())), ())
+    assert near.together == 2
+
+
+@pytest.mark.parametrize(
+    ("theory", "level", "doubt"),
+    [
+        ("topological", "places", None),
+        ("topological", None, None),
+        ("topological", "dstates", "8 of 8 dstates share their position with others: .* export places"),
+        ("causal", None, "2 of 2 dstates share their position with others: .*--theory topological"),
+    ],
+)
+@pytest.mark.parametrize("to", formats.FOR_NAVIGATION)
+def test_nodes_at_one_position_are_told(
+    to: str, theory: str, level: str | None, doubt: str | None, square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = f"{tmp_path}/map.json"
+    (square if theory == "topological" else causal_pair()).save(file)
+    assert main(["export", file, "--to", to, *([] if level is None else ["--level", level])]) == 0
+    said = capsys.readouterr().err
+    assert re.search(doubt, said) if doubt else said == ""
+
+
+def causal_pair() -> SSHMap:
+    """A map without places: one position, two headings."""
+    trace = Trace.from_steps(["a", "b", "a"], ["left", "right"], displacements=[(0, 0, 1.5708), (0, 0, -1.5708)])
+    return solve(trace, Theory.causal()).maps[0]
 
 
 def test_nav2_gets_metres_from_poses(square: SSHMap) -> None:
@@ -158,7 +271,6 @@ def test_what_no_file_can_hold_is_refused(square: SSHMap) -> None:
 
 def test_the_command_writes_what_python_makes(square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]) -> None:
     assert verb.FORMATS == formats.FORMATS
-    assert verb.FOR_NAVIGATION == formats.FOR_NAVIGATION
     file = f"{tmp_path}/map.json"
     square.save(file)
     assert main(["export", file, "--to", "nav2", "-o", f"{tmp_path}/graph.geojson"]) == 0

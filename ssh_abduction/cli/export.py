@@ -9,8 +9,8 @@ from ssh_abduction.cli.options import Verbs
 from ssh_abduction.errors import MapError
 from ssh_abduction.trace import Trace
 
-# As ssh_abduction.export has them; that loads networkx, which would delay each verb.
-FORMATS, FOR_NAVIGATION = ("nav2", "tmap2", "graphml", "dot", "networkx-json"), ("nav2", "tmap2")
+# As ssh_abduction.export has them, which loads networkx, which would delay each verb.
+FORMATS = ("nav2", "tmap2", "graphml", "dot", "networkx-json")
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -35,7 +35,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.export.formats import export_map, is_metric  # which loads networkx
+    from ssh_abduction.export.formats import doubts, export_map  # which loads networkx
     from ssh_abduction.maps import write_map
     from ssh_abduction.rivals.listing import Listing
 
@@ -50,9 +50,6 @@ def run(options: argparse.Namespace) -> int:
         print(text.removesuffix("\n"))
     else:
         write_map(options.output, text.removesuffix("\n"), "map", "--output")
-    if options.to in FOR_NAVIGATION and not is_metric(chosen):
-        print(
-            "ssh-abduction: warning: the map has no poses: its positions are of a layout, and no metres; solve a trace with displacements",
-            file=sys.stderr,
-        )
+    for doubt in doubts(chosen, options.to, level=options.level, turns=turns):
+        print(f"ssh-abduction: warning: {doubt}", file=sys.stderr)
     return 0

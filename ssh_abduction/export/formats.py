@@ -18,7 +18,7 @@ from ssh_abduction.export.nav2 import nav2
 from ssh_abduction.export.roads import Roads
 from ssh_abduction.export.tmap2 import tmap2
 from ssh_abduction.files import json_line
-from ssh_abduction.layout import Turns, located
+from ssh_abduction.layout import Turns
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.trace import Trace
 
@@ -49,8 +49,7 @@ def export_map(
     """
     if to not in FORMATS:
         raise MapError(f"to: expected {', '.join(FORMATS[:-1])} or {FORMATS[-1]}, got {brief(to)}; take one of these")
-    if level is None:
-        level = "places" if to in FOR_NAVIGATION and ssh_map.places else "dstates"
+    level = _level(ssh_map, to, level)
     if level not in LEVELS:
         raise MapError(f"level: expected places or dstates, got {brief(level)}; say what nodes are")
     for field, text in (("name", name), ("frame", frame)):
@@ -80,6 +79,32 @@ def _graph_of_places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.Graph[A
     return graph
 
 
-def is_metric(ssh_map: SSHMap) -> bool:
-    """Whether the positions of an exported map are metres, and not of a layout."""
-    return located(ssh_map) is not None
+def doubts(ssh_map: SSHMap, to: str, *, level: str | None = None, turns: Trace | Turns | None = None) -> tuple[str, ...]:
+    """What a program that navigates by an exported map may stumble over.
+
+    Args:
+        ssh_map: The map.
+        to: The format, as `export_map` takes it; so are `level` and `turns`.
+
+    Returns:
+        A sentence for each. None for formats that nothing navigates by.
+    """
+    if to not in FOR_NAVIGATION:
+        return ()
+    level = _level(ssh_map, to, level)
+    roads = Roads.of(ssh_map, level, turns)
+    found = []
+    if not roads.metric:
+        found.append("the map has no poses: its positions are of a layout, and no metres; solve a trace with displacements")
+    if together := roads.together:
+        mend = "export places (--level places)" if ssh_map.places else "solve with places (--theory topological)"
+        found.append(
+            f"{together} of {len(roads.stops)} {level} share their position with others: "
+            f"programs that look nodes up by position may take a wrong one; {mend}"
+        )
+    return tuple(found)
+
+
+def _level(ssh_map: SSHMap, to: str, level: str | None) -> str:
+    """The level that is exported where none is asked for."""
+    return level if level is not None else "places" if to in FOR_NAVIGATION and ssh_map.places else "dstates"

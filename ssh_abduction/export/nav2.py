@@ -39,4 +39,4 @@ def _node(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
 def _edge(road: Road, number: int) -> dict[str, Any]:
     known = {"action": road.action, "path": road.path, "direction": road.direction}
     metadata = {"travelled": road.action is not None, **{field: value for field, value in known.items() if value is not None}}
-    return {"id": number, "startid": road.start, "endid": road.end, "cost": round(road.length, DIGITS), "metadata": metadata}
+    return {"id": number, "startid": road.start, "endid": road.end, "cost": round(road.cost, DIGITS), "metadata": metadata}

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 
 from ssh_abduction.errors import MapError
 from ssh_abduction.layout import Turns, layout, travelled
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.trace import Trace, View
+
+# What an edge costs at least, in metres. A turn on the spot costs as much as half a metre: a robot that drives 0.5 m/s turns by 90° in a second or two.
+LEAST, TURN = 0.01, 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +39,7 @@ class Road:
     length     in a straight line, in metres or units of the layout; of a turn on the spot 0
     action     what the robot did there; None where it only drove the other way
     path, direction  along which path, and which way; None where it is along none
+    turns      whether it is a turn on the spot: it stays at a place, or where places are unknown at a point
     """
 
     start: int
@@ -43,6 +48,12 @@ class Road:
     action: str | None
     path: int | None
     direction: int | None
+    turns: bool = False
+
+    @property
+    def cost(self) -> float:
+        """What a planner is to take for the length: above 0, as Nav2's planner refuses edges that cost nothing, and more for a turn on the spot."""
+        return self.length + TURN if self.turns else max(self.length, LEAST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +98,25 @@ class Roads:
                 for here, there in [(ssh_map.dstates[s], ssh_map.dstates[x])]
             }
         at = {stop.id: (stop.x, stop.y) for stop in stops}
-        roads = tuple(Road(a, b, math.dist(at[a], at[b]), *what) for (a, b), what in sorted(ends.items()))
+        place = {s.id: s.place for s in ssh_map.dstates} if level == "dstates" else {}
+        roads = tuple(
+            Road(a, b, length := math.dist(at[a], at[b]), *what, turns=_is_turn(place.get(a), place.get(b), length))
+            for (a, b), what in sorted(ends.items())
+        )
         if not roads:
             raise MapError(f"map: expected roads between its {level}, got none; log a trace that moves on")
         return cls(level, drawn.metric, stops, roads)
+
+    @property
+    def together(self) -> int:
+        """How many stops are where another stop is, too."""
+        counts = Counter((round(stop.x, 2), round(stop.y, 2)) for stop in self.stops)
+        return sum(count for count in counts.values() if count > 1)
+
+
+def _is_turn(here: int | None, there: int | None, length: float) -> bool:
+    """Whether a road between dstates of these places is a turn on the spot."""
+    return length < LEAST if here is None or there is None else here == there
 
 
 def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], tuple[str | None, int | None, int | None]]:

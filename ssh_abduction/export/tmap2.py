@@ -1,19 +1,27 @@
-"""Topological maps of LCAS's topological_navigation: tmap2, in YAML, as its schema describes them."""
+"""Topological maps of LCAS's topological_navigation: tmap2, in YAML, as its schema describes them.
+
+Two generations of its navigation read these maps, and both can drive them. The one of ROS 2 Humble imports the `action` of an edge
+from nav2_msgs.action, and takes the `goal` of the edge, in which "$node.pose" stands for the pose of the node that the edge leads to.
+The later one, a graph of networkx, looks the action up in the `actions` of the map, and takes `properties.weight` for the cost of an edge.
+"""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
 
+import numpy as np
+import yaml
+
 from ssh_abduction.export.roads import Road, Roads, Stop
 
-ACTION, ACTION_TYPE = "navigate_to_pose", "nav2_msgs.action.NavigateToPose"
+ACTION = "NavigateToPose"
 DIGITS = 4  # of coordinates, in metres
-# Tolerances of goals, in metres and radians, and the radius of the octagon around a node in which a robot is at it, in metres: those of the programs' own examples.
-NEAR, FACING, RADIUS = 0.3, 0.1, 0.75
+# Tolerances of goals in metres and radians: those of the programs' own examples. A dstate has a heading, and a place has any.
+NEAR, FACING = 0.3, {"dstates": 0.1, "places": 6.28}
+# The octagon around a node in which a robot is at the node has this radius, in metres.
+RADIUS = 0.75
 
 
 def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) -> str:
@@ -35,12 +43,24 @@ def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) 
         "name": name,
         "pointset": name,
         "transformation": {"rotation": _rotation(0.0), "translation": {"x": 0.0, "y": 0.0, "z": 0.0}, "child": "topo_map", "parent": frame},
-        "nodes": [_node(stop, leaving[stop.id], names, name, frame) for stop in roads.stops],
+        "actions": {ACTION: _action()},
+        "nodes": [_node(stop, leaving[stop.id], names, name, frame, FACING[roads.level]) for stop in roads.stops],
     }
-    return "\n".join(_yaml(data)) + "\n"
+    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=2**16)
+    return text
 
 
-def _node(stop: Stop, leaving: list[Road], names: dict[int, str], pointset: str, frame: str) -> dict[str, Any]:
+def _action() -> dict[str, Any]:
+    """What the action of all edges is, for the navigation that looks it up in the map."""
+    return {
+        "action_type": f"nav2_msgs.action.{ACTION}",
+        "action_server": "/navigate_to_pose",
+        "composable": False,
+        "action_goal_template": {"pose": {"header": {"frame_id": "${node.nav_frame}"}, "pose": "${node.pose}"}},
+    }
+
+
+def _node(stop: Stop, leaving: list[Road], names: dict[int, str], pointset: str, frame: str, facing: float) -> dict[str, Any]:
     corners = [math.tau * (i + 0.5) / 8 for i in range(8)]
     return {
         "meta": {"map": pointset, "node": names[stop.id], "pointset": pointset},
@@ -49,13 +69,13 @@ def _node(stop: Stop, leaving: list[Road], names: dict[int, str], pointset: str,
             "parent_frame": frame,
             "localise_by_topic": "",
             "pose": {
-                "position": {"x": round(stop.x, DIGITS), "y": round(stop.y, DIGITS), "z": 0.0},
+                "position": {"x": _rounded(stop.x), "y": _rounded(stop.y), "z": 0.0},
                 "orientation": _rotation(stop.heading),
             },
-            "properties": {"xy_goal_tolerance": NEAR, "yaw_goal_tolerance": FACING, "views": " ".join(map(str, stop.views))},
+            "properties": {"xy_goal_tolerance": NEAR, "yaw_goal_tolerance": facing, "views": " ".join(map(str, stop.views))},
             "restrictions_planning": "True",
             "restrictions_runtime": "True",
-            "verts": [{"x": round(RADIUS * math.cos(a), DIGITS), "y": round(RADIUS * math.sin(a), DIGITS)} for a in corners],
+            "verts": [{"x": _rounded(RADIUS * math.cos(a)), "y": _rounded(RADIUS * math.sin(a))} for a in corners],
             "edges": [_edge(road, names) for road in leaving],
         },
     }
@@ -66,16 +86,17 @@ def _edge(road: Road, names: dict[int, str]) -> dict[str, Any]:
         "edge_id": f"{names[road.start]}_{names[road.end]}",
         "node": names[road.end],
         "action": ACTION,
-        "action_type": ACTION_TYPE,
+        "action_type": f"nav2_msgs/action/{ACTION}",
         "config": [],
         "fail_policy": "fail",
         "fluid_navigation": True,
-        "goal": {},
+        "goal": {"target_pose": {"header": {"frame_id": "$node.parent_frame"}, "pose": "$node.pose"}},
         "recovery_behaviours_config": "",
         "restrictions_planning": "True",
         "restrictions_runtime": "True",
         "properties": {
-            "length": round(road.length, DIGITS),
+            "weight": _rounded(road.length),
+            "length": _rounded(road.length),
             "travelled": road.action is not None,
             **({} if road.action is None else {"robot_action": road.action}),
         },
@@ -84,25 +105,18 @@ def _edge(road: Road, names: dict[int, str]) -> dict[str, Any]:
 
 def _rotation(heading: float) -> dict[str, float]:
     """A turn about the vertical as a quaternion."""
-    return {"w": round(math.cos(heading / 2), 6), "x": 0.0, "y": 0.0, "z": round(math.sin(heading / 2), 6)}
+    return {"w": _rounded(math.cos(heading / 2), 6), "x": 0.0, "y": 0.0, "z": _rounded(math.sin(heading / 2), 6)}
 
 
-def _yaml(value: Any, indent: str = "") -> Iterator[str]:
-    """The lines of a value in YAML's block style. Scalars are written as JSON writes them, which YAML reads alike."""
-    for name, item in value.items() if isinstance(value, dict) else (("-", item) for item in value):
-        head = f"{indent}-" if name == "-" else f"{indent}{name}:"
-        if not isinstance(item, dict | list) or not item:
-            yield f"{head} {_scalar(item)}"
-        elif name == "-":
-            first, *rest = _yaml(item, f"{indent}  ")
-            yield f"{head} {first.lstrip()}"
-            yield from rest
-        else:
-            yield head
-            yield from _yaml(item, f"{indent}  ")
+def _rounded(number: float, digits: int = DIGITS) -> float:
+    """A number with so many decimals; a zero has no sign."""
+    return round(number, digits) + 0.0
 
 
-def _scalar(value: Any) -> str:
-    if isinstance(value, str):
-        return '"' + "".join(c if c.isprintable() and c not in '"\\' else json.dumps(c)[1:-1] for c in value) + '"'
-    return json.dumps(value)
+class _Dumper(yaml.SafeDumper):
+    """Writes numbers with a decimal point and without an exponent: PyYAML reads 4e-06 as a text."""
+
+
+_Dumper.add_representer(
+    float, lambda dumper, number: dumper.represent_scalar("tag:yaml.org,2002:float", np.format_float_positional(number, trim="0"))
+)
