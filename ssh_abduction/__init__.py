@@ -1,9 +1,8 @@
 """From what a robot saw and did, find the map: every minimal topological map of distinctive states, places and paths.
 
-A name is loaded when it is first used: so the command line begins at once, and hears Ctrl-C from then on.
+A name is loaded when it is first used: so the command line begins at once, and hears Ctrl-C from then on. Nothing is imported before
+`__main__` has put the current folder behind Python's own modules, not even `__future__`.
 """
-
-from __future__ import annotations
 
 TYPE_CHECKING = False  # as in typing, which takes longer to load than all that is here
 
@@ -120,7 +119,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     import importlib
 
     if name == "__version__":

@@ -1,16 +1,16 @@
 """The command line as a program. It loads nothing until it knows what Ctrl-C is to do."""
 
-from __future__ import annotations
-
 import os
 import sys
 
-INTERRUPTED = 130  # the exit code of a program that Ctrl-C ended
+from ssh_abduction import program
+
+sys.path[:] = program.search_path()  # `python -m` puts the current folder first, and a file there is no module of Python's
 
 try:
     import signal
 except KeyboardInterrupt:
-    os._exit(INTERRUPTED)
+    os._exit(program.interrupted_code())
 
 TYPE_CHECKING = False  # as in typing, which takes longer to load than all that is here
 
@@ -19,35 +19,44 @@ if TYPE_CHECKING:
     from typing import NoReturn
 
 
-def run() -> NoReturn:
-    """Run the command line and exit with its code; with 130, and without a traceback, after Ctrl-C at any time."""
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background of some shells
-        signal.signal(signal.SIGINT, _interrupt)
+def run() -> "NoReturn":
+    """Run the command line and exit with its code.
+
+    After Ctrl-C at any time the code is 130, after SIGTERM 143, and there is no traceback.
+    """
+    numbers = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
+    for number in numbers:  # some shells let programs in the background ignore Ctrl-C
+        signal.signal(number, _interrupt)
     try:
         from ssh_abduction.cli import main
 
         code = main()
-        if signal.getsignal(signal.SIGINT) is _interrupt:
-            signal.signal(signal.SIGINT, _end)
+        for number in numbers:
+            if signal.getsignal(number) is _interrupt:
+                signal.signal(number, _end)
     except KeyboardInterrupt:
         _end()
     sys.exit(code)
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
+def _interrupt(number: int, frame: "FrameType | None") -> None:
     """Ctrl-C is a KeyboardInterrupt, but while a module is loaded it ends the program at once.
 
     Nothing is lost by that; and what is written in C, such as numpy, prints a traceback or makes another error of a KeyboardInterrupt.
     """
+    program.heard.append(number)
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             _end()
         frame = frame.f_back
+    program.raised.append(number)
     raise KeyboardInterrupt
 
 
-def _end(*_: object) -> NoReturn:
-    os._exit(INTERRUPTED)
+def _end(number: "int | None" = None, _: object = None) -> "NoReturn":
+    if number is not None:
+        program.heard.append(number)
+    os._exit(program.interrupted_code())
 
 
 if __name__ == "__main__":

@@ -23,7 +23,8 @@ from distributed import LocalCluster
 from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Speedups, Theory, Trace
-from ssh_abduction.cli import batch, main, mapping, workers
+from ssh_abduction.asp import workers
+from ssh_abduction.cli import batch, main, mapping
 from ssh_abduction.cli.batch import Answer, Question, Stop
 from ssh_abduction.cli.mapping import MapAnswer, MapQuestion
 

@@ -18,9 +18,9 @@ from limits import Case, cases, outcome
 from worlds import rectangle
 
 from ssh_abduction import Search, Status, Theory, Trace, solve
+from ssh_abduction.asp import workers
 from ssh_abduction.asp.control import Control
 from ssh_abduction.asp.limits import LimitError, Watch, peak_memory
-from ssh_abduction.cli import workers
 from ssh_abduction.explain import Axioms, Interrupted, Piece
 from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.solver.candidates import Candidates
@@ -267,7 +267,7 @@ def test_what_is_given_up_is_answered_and_nothing_begins() -> None:
 @POSIX
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "pid"
-    program = f"from ssh_abduction.cli import workers; from test_limits import stay; list(workers.answers(stay, [(0, {str(path)!r})], 1, bool, None, 1.0))"
+    program = f"from ssh_abduction.asp import workers; from test_limits import stay; list(workers.answers(stay, [(0, {str(path)!r})], 1, bool, None, 1.0))"
     with subprocess.Popen([sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}) as parent:
         while not (path.exists() and path.read_text()):
             assert parent.poll() is None

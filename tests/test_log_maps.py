@@ -24,7 +24,8 @@ from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
 from simulator.rounds import record_plan
 from ssh_abduction import SSHError, Theory, log_maps
-from ssh_abduction.cli import batch, main, workers
+from ssh_abduction.asp import workers
+from ssh_abduction.cli import batch, main
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.evaluation import evaluate_visits

@@ -46,19 +46,22 @@ def _end_all() -> None:
 
 @contextmanager
 def _held_back_interrupts() -> Iterator[None]:
-    """Ctrl-C takes effect when this context ends. Raised while clingo starts a thread, it would leave the thread without an owner."""
-    before = signal.getsignal(signal.SIGINT)
-    if before is None or threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+    """Ctrl-C and SIGTERM take effect when this context ends. Raised while clingo starts a thread, they would leave the thread without an owner."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    held = {number: handler for number, handler in handlers.items() if callable(handler)}
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield
         return
     caught: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, _: caught.append(number))
+    for number in held:
+        signal.signal(number, lambda caught_number, _: caught.append(caught_number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-    if caught and callable(before):
-        before(signal.SIGINT, None)
+        for number, handler in held.items():
+            signal.signal(number, handler)
+    for caught_number in caught[:1]:
+        held[signal.Signals(caught_number)](caught_number, None)
 
 
 Answer = TypeVar("Answer")

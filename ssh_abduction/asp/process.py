@@ -18,11 +18,11 @@ from contextlib import suppress
 from typing import TypeVar
 
 from ssh_abduction.asp.limits import POLL, LimitError, Watch
+from ssh_abduction.program import command, search_path
 
 Result = TypeVar("Result")
 
 _under_way: set[subprocess.Popen[bytes]] = set()
-_SERVE = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from ssh_abduction.asp.process import serve; serve()"
 
 
 def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) -> Result:
@@ -52,13 +52,13 @@ def _run(work: Callable[..., object], arguments: tuple[object, ...], watch: Watc
     with (
         suppress(OSError),
         tempfile.TemporaryFile() as answer,
-        subprocess.Popen([sys.executable, "-c", _SERVE], stdin=subprocess.PIPE, stdout=answer, stderr=subprocess.DEVNULL) as process,
+        subprocess.Popen(command(__name__), stdin=subprocess.PIPE, stdout=answer, stderr=subprocess.DEVNULL) as process,
     ):
         assert process.stdin
         _under_way.add(process)
         try:
             with suppress(BrokenPipeError):
-                for sent in (sys.path, (work, arguments, watch.memory_left())):
+                for sent in (search_path(), (work, arguments, watch.memory_left())):
                     pickle.dump(sent, process.stdin)
                 process.stdin.flush()
             while process.poll() is None:

@@ -22,8 +22,9 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
+from ssh_abduction.asp import workers
 from ssh_abduction.asp.limits import Stop as SearchStop
-from ssh_abduction.cli import EXIT_ERROR, EXIT_INTERRUPTED, workers
+from ssh_abduction.cli import EXIT_ERROR
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.outcome import (
@@ -34,7 +35,6 @@ from ssh_abduction.cli.outcome import (
     exit_code,
     explained,
     given_by,
-    interrupted_code,
     on_ctrl_c,
     opening,
     told,
@@ -44,6 +44,7 @@ from ssh_abduction.cli.outcome import (
 from ssh_abduction.cli.text import headline
 from ssh_abduction.errors import SolverError, SSHError, brief, named, printable
 from ssh_abduction.explain import Explanation
+from ssh_abduction.program import SIGNALLED, interrupted_code
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.sharing import Backbone
@@ -242,7 +243,7 @@ def run(options: argparse.Namespace) -> int:
         codes = _printed(answers, len(paths), stop)
         stopped = stop.is_set()
     if stopped:
-        missing = len(paths) - sum(code != EXIT_INTERRUPTED for code in codes)
+        missing = len(paths) - sum(code <= SIGNALLED for code in codes)
         print(f"ssh-abduction: interrupted: {missing} of {len(paths)} traces not finished", file=sys.stderr)
         return interrupted_code()
     if errors := codes.count(EXIT_ERROR):
@@ -267,7 +268,7 @@ def _printed(answers: Generator[Answer], total: int, stop: Stop) -> list[int]:
                     while turn in lines:
                         say(lines.pop(turn))
                         turn += 1
-                if answer.code == EXIT_INTERRUPTED:
+                if answer.code > SIGNALLED:
                     stop.set()
         except KeyboardInterrupt:
             stop.set()

@@ -18,14 +18,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ssh_abduction.asp import workers
 from ssh_abduction.asp.limits import check_limit
-from ssh_abduction.cli import EXIT_ERROR, batch, workers
+from ssh_abduction.cli import EXIT_ERROR, batch
 from ssh_abduction.cli.import_log import damage, doors_of, named_after
 from ssh_abduction.cli.options import choices_of, theory_of
-from ssh_abduction.cli.outcome import exit_code, interrupted_code, warn
+from ssh_abduction.cli.outcome import exit_code, warn
 from ssh_abduction.cli.text import counted
 from ssh_abduction.errors import SolverError, SSHError, named
 from ssh_abduction.files import write_file
+from ssh_abduction.program import interrupted_code
 from ssh_abduction.theory.theory import Theory
 
 # The name of a log that goes to a worker keeps so much of its end.

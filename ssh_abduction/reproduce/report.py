@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import platform
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from joblib import Parallel, delayed
+from joblib import effective_n_jobs
 
 from perception.images import images_of
 from simulator.control import STILL, Tolerance
@@ -20,6 +20,8 @@ from simulator.laser import Laser
 from simulator.robot import Body
 from simulator.tours import simulate
 from simulator.world import World
+from ssh_abduction import program
+from ssh_abduction.asp import workers
 from ssh_abduction.errors import SSHError
 from ssh_abduction.files import write_file
 from ssh_abduction.learner import BootstrapLearner
@@ -63,7 +65,7 @@ def reproduce(
     figures.require_matplotlib()
     folder.mkdir(parents=True, exist_ok=True)
     runs: list[Run] = []
-    for run in Parallel(n_jobs=jobs, return_as="generator")(delayed(measure)(name, seed) for seed in seeds):
+    for run in _each(measure, [(name, seed) for seed in seeds], jobs):
         runs.append(run)
         on_done(f"seed {run.seed}")
     table = summary(name, runs)
@@ -73,7 +75,7 @@ def reproduce(
     found: list[Outcome] = []
     if outcomes and name == "notched-rectangle":
         grid = [(notch, scale) for notch in NOTCHES for scale in SCALES]
-        for o in Parallel(n_jobs=jobs, return_as="generator")(delayed(outcome)(notch, scale) for notch, scale in grid):
+        for o in _each(outcome, grid, jobs):
             found.append(o)
             on_done(f"notch {100 * o.notch:g} cm, spread {1000 * o.spread:.1f} mm")
         _dump(folder / "outcomes.json", [asdict(o) for o in found])
@@ -85,6 +87,39 @@ def reproduce(
         figures.draw_outcomes(folder / "outcomes.png", found, (depth, 1.0))
     write_file(folder / "report.html", _page(name, runs, table, folder).encode())
     return table
+
+
+def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[Any]:
+    """The results of `work` for these tasks, in their order, from as many processes as asked for. Raises what `work` raises, and KeyboardInterrupt."""
+    processes = min(effective_n_jobs(jobs), len(tasks))
+    if processes == 1:
+        for task in tasks:
+            result = work(*task)
+            if program.raised:  # a search that is interrupted ends with its best answer so far, and that is none for the paper's claims
+                raise KeyboardInterrupt
+            yield result
+        return
+    ready: dict[int, Any] = {}  # results whose turn has not come
+    turn = 0
+    numbered = [(number, work, task) for number, task in enumerate(tasks)]
+    for answer in workers.answers(_done, numbered, processes, lambda: False, None, 0.0):
+        if isinstance(answer, workers.Lost):
+            raise SSHError("process: expected an answer, got killed, as happens when memory runs out; take fewer --jobs")
+        number, ready[number] = answer
+        while turn in ready:
+            result = ready.pop(turn)
+            if isinstance(result, Exception):
+                raise result
+            yield result
+            turn += 1
+
+
+def _done(number: int, work: Callable[..., Any], task: tuple[Any, ...], _: Callable[[], bool]) -> tuple[int, Any]:
+    """The result of `work`, or what it raised, in a process that does nothing else."""
+    try:
+        return number, work(*task)
+    except Exception as error:
+        return number, error
 
 
 def steps(name: str, seeds: Sequence[int], outcomes: bool) -> int:

@@ -1,6 +1,7 @@
 """Processes that do one piece of work after another, each begun anew rather than forked: a process that is forked while a thread grounds may wait for ever.
 
 They end when the process that began them does, however that ends: their input ends then. One that is killed loses the piece it was at, and no other.
+Their temporary files lie in one folder, which goes with them.
 """
 
 from __future__ import annotations
@@ -8,14 +9,18 @@ from __future__ import annotations
 import os
 import pickle
 import queue
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, BinaryIO, NamedTuple
+
+from ssh_abduction.program import command, search_path
 
 # So many seconds a process may take to begin, at most, on a machine that has much else to do.
 STARTING = 10.0
@@ -23,7 +28,6 @@ STARTING = 10.0
 POLL = 0.05
 
 _BEGIN = b"\0ssh-abduction answers\n"  # what is printed before, as Python begins, is no answer
-_SERVE = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from ssh_abduction.cli.workers import serve; serve()"
 
 
 class Lost(NamedTuple):
@@ -36,15 +40,16 @@ class Lost(NamedTuple):
 class Worker:
     """A process that does one piece of work at a time, until `end`.
 
+    folder    where its temporary files are made
     deadline  when the piece under way is to be answered, at the latest; then the process is killed
     """
 
-    def __init__(self) -> None:
+    def __init__(self, folder: str) -> None:
         self.deadline: float | None = None
         self._late = False
-        command = [sys.executable, "-c", _SERVE]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-        self._send(sys.path)
+        self._process = subprocess.Popen(command(__name__), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        self._send(search_path())
+        self._send(folder)
         self._begun = False
 
     def end(self) -> None:
@@ -121,19 +126,20 @@ def answers(
         waiting.put(task)
     ready = queue.SimpleQueue[Any]()  # answers, and a None for each thread that ends
     workers: list[Worker | None] = [None] * processes
+    over = threading.Event()  # nobody waits for answers any more
+    folder = tempfile.TemporaryDirectory(prefix="ssh-abduction-", ignore_cleanup_errors=True)
 
     def run(place: int) -> None:
         try:
-            while not stopped():
+            while not (stopped() or over.is_set()):
                 task = waiting.get_nowait()
-                worker = workers[place]
-                begins = worker is None or not worker.is_alive
-                if worker is not None and begins:
+                before = workers[place]
+                worker = workers[place] = _living(before, folder.name)
+                if over.is_set():  # whoever ended the others has perhaps not seen this one
                     worker.end()
-                if worker is None or begins:
-                    worker = workers[place] = Worker()
+                    break
                 if seconds is not None:
-                    worker.deadline = time.monotonic() + seconds + (STARTING if begins else 0.0)
+                    worker.deadline = time.monotonic() + seconds + (0.0 if worker is before else STARTING)
                 ready.put(worker.done(task[0], work, task))
         except queue.Empty:
             pass
@@ -163,14 +169,35 @@ def answers(
                 else:
                     yield answer
     finally:
-        for worker in filter(None, workers):
-            worker.end()
+        over.set()
+        _end([*filter(None, workers)], threads)
+        folder.cleanup()
+
+
+def _living(worker: Worker | None, folder: str) -> Worker:
+    """This process, or a new one if there is none or it has ended."""
+    if worker is not None and worker.is_alive:
+        return worker
+    if worker is not None:
+        worker.end()
+    return Worker(folder)
+
+
+def _end(workers: Sequence[Worker], threads: Sequence[threading.Thread]) -> None:
+    """Kill processes, and close what leads to them once the threads that read from it have ended."""
+    for worker in workers:
+        worker.kill()
+    for thread in threads:
+        thread.join()
+    for worker in workers:
+        worker.end()
 
 
 class _Work:
-    """The pieces of work that come in, in a process that does them."""
+    """The pieces of work that come in, in a process that does them, and the folder for its temporary files."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: str) -> None:
+        self._folder = folder
         self._given_up = False
         self._waiting = queue.SimpleQueue[tuple[Callable[..., Any], tuple[object, ...]]]()
         threading.Thread(target=self._read, daemon=True).start()
@@ -184,6 +211,7 @@ class _Work:
                 else:
                     self._waiting.put(message)
         finally:  # whoever waits for the answers is gone
+            shutil.rmtree(self._folder, ignore_errors=True)
             os._exit(1)
 
     def is_given_up(self) -> bool:
@@ -216,7 +244,8 @@ def serve() -> None:
     output.write(_BEGIN)
     output.flush()
     _outputs.append(output)
-    pieces = _Work()
+    tempfile.tempdir = pickle.load(sys.stdin.buffer)
+    pieces = _Work(tempfile.tempdir)
     while True:
         work, arguments = pieces.next()
         reply(work(*arguments, pieces.is_given_up))
