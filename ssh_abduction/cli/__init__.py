@@ -18,6 +18,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, NoReturn
 
+from ssh_abduction import program
 from ssh_abduction.cli import (
     check,
     cluster,
@@ -42,10 +43,11 @@ from ssh_abduction.cli import (
     view,
 )
 from ssh_abduction.cli import reproduce as reproduction
+from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.verbosity import add_verbosity, telling
 from ssh_abduction.errors import SSHError, named, printable
 
-EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
+EXIT_ERROR = 1
 MENDS = {
     errno.ENOSPC: "make room",
     errno.ENOENT: "make the folder first",
@@ -138,9 +140,10 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code. SystemExit, with code 2, for wrong usage."""
     try:
-        return _main(arguments)
+        code = _main(arguments)
     except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+        return program.interrupted_code()
+    return program.interrupted_code() if program.raised else code  # a search may take Ctrl-C for its own end, and its verb goes on
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -168,7 +171,8 @@ def _main(arguments: Sequence[str] | None) -> int:
             raise SSHError("standard output: expected a place to print to, got a closed stream; open it, or send it to a file")
         with telling(options, for_programs), warnings.catch_warnings(record=True) as caught:
             try:
-                code = int(options.run(options))
+                with Guard(lambda: None, lambda _: ("", program.interrupted_code()), None, None):
+                    code = int(options.run(options))
             finally:
                 for warning in caught:
                     print(f"ssh-abduction: warning: {printable(str(warning.message))}", file=sys.stderr)

@@ -8,8 +8,9 @@ from typing import Any
 from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, read_maps, theory_of
-from ssh_abduction.cli.outcome import dump, interrupted_code, on_ctrl_c
+from ssh_abduction.cli.outcome import dump, on_ctrl_c
 from ssh_abduction.errors import MapError, SSHError, named
+from ssh_abduction.program import interrupted_code
 from ssh_abduction.rivals.explain import PairExplanation, PairQuestion, TraceExplanation, TraceQuestion, Verdict
 from ssh_abduction.solver.recorded import theory_in
 from ssh_abduction.theory.theory import Theory

@@ -17,6 +17,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, NoReturn, Self
 
+from ssh_abduction import program
 from ssh_abduction.asp.limits import POLL, Stop, resident_memory
 from ssh_abduction.asp.process import end_all
 
@@ -56,7 +57,6 @@ class Guard:
         self._waited = 0.0  # seconds that whoever reads the output took, which do not count
         self._writes_since: float | None = None  # when the piece of text that is being printed was begun
         self._began = time.monotonic()
-        self._signal = int(signal.SIGINT)  # that asked for an end
         self._hears: socket.socket | None = None
         self._before = -1
 
@@ -101,14 +101,14 @@ class Guard:
                 finally:
                     self._speaking.release()
             elif self._is_unread():
-                self._leave(128 + self._signal)
+                self._leave(program.interrupted_code())
 
     def _is_called(self) -> bool:
         """Whether somebody asks for an end."""
         if self._hears is not None:
             with suppress(BlockingIOError):
                 heard = [number for number in self._hears.recv(64) if number in (signal.SIGINT, signal.SIGTERM)]
-                self._signal = heard[-1] if heard else self._signal
+                program.heard.extend(heard)  # as the handler of the main thread has perhaps not run, and will not
                 return bool(heard) or self._given_up()
         return self._given_up()
 

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.asp.limits import Watch, check_limit
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
-from ssh_abduction.cli.outcome import interrupted_code, on_ctrl_c, warn
+from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.text import table
 from ssh_abduction.errors import MapError, named, printable
 from ssh_abduction.files import json_line
 from ssh_abduction.maps import maps_of, read_json
+from ssh_abduction.program import interrupted_code
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
 

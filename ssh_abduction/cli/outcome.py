@@ -11,6 +11,7 @@ from itertools import zip_longest
 from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
+from ssh_abduction import program
 from ssh_abduction.engines.base import Cost
 from ssh_abduction.explain import Explanation, Interrupted, explain
 from ssh_abduction.files import json_line
@@ -25,18 +26,12 @@ Given: TypeAlias = tuple[SSHMap, Cost | None]
 
 LEAST_LEFT = 0.2  # seconds of a time limit, with less of which the runner-up is not looked at
 
-_heard: list[int] = []  # signals that asked for an end
 EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}
 
 
 def exit_code(solution: Solution) -> int:
     """What the shell is told of a solution."""
-    return interrupted_code() if solution.stopped == "interrupted" else EXIT_CODES[solution.status]
-
-
-def interrupted_code() -> int:
-    """What the shell is told where somebody ended the search: 130 after Ctrl-C, 143 after SIGTERM."""
-    return 128 + (_heard[-1] if _heard else signal.SIGINT)
+    return program.interrupted_code() if solution.stopped == "interrupted" else EXIT_CODES[solution.status]
 
 
 def explained(search: Search) -> Explanation | None:
@@ -118,19 +113,24 @@ def dump(value: dict[str, Any]) -> str:
 
 @contextlib.contextmanager
 def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
-    """Ctrl-C and SIGTERM do this, rather than stop the program wherever it is: what was found is still printed. None: nothing, nor in processes that begin."""
+    """Ctrl-C and SIGTERM do this, rather than stop the program wherever it is: what was found is still printed. None: nothing, nor in processes that begin.
+
+    The guard of the whole program hears nothing meanwhile: who takes signals into his own hands needs a guard of his own if he may be deaf.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may handle signals
         return
 
     def hear(number: int, _: object) -> None:
-        _heard.append(number)
+        program.heard.append(number)
         if action:
             action()
 
     before = {number: signal.signal(number, hear if action else signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    told = signal.set_wakeup_fd(-1)
     try:
         yield
     finally:
+        signal.set_wakeup_fd(told, warn_on_full_buffer=False)
         for number, handler in before.items():
             signal.signal(number, handler)

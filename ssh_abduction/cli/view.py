@@ -146,6 +146,9 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
 def _serve(
     options: argparse.Namespace, listing: Listing, trace: Trace, theory: Theory | None, localised: Run | None, called: Called
 ) -> int:
+    import signal
+
+    from ssh_abduction import program
     from ssh_abduction.asp.process import end_all
     from ssh_abduction.rivals.page.server import PageServer
 
@@ -160,7 +163,8 @@ def _serve(
         try:
             server.serve_forever()
         except KeyboardInterrupt:
-            return 0
+            if program.heard[-1:] != [signal.SIGTERM]:
+                program.raised.clear()  # Ctrl-C is how a page is closed
         finally:
             end_all()
     return 0
