@@ -11,7 +11,7 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from statistics import median
@@ -23,9 +23,8 @@ from ssh_abduction.files import json_line
 from ssh_abduction.log_report import report
 from ssh_abduction.logs import log_of
 from ssh_abduction.rivals.page.html import view_page
-from ssh_abduction.rungs import Rung, ladder, rungs
+from ssh_abduction.rungs import Rung, UnderWay, ladder, rungs
 from ssh_abduction.solver.result import Solution, Status
-from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
@@ -42,6 +41,8 @@ SPEED = 0.5
 MAPS = 300
 # What is said where no map fits the stars that the walls suggested to use.
 NO_STARS = "No map fits the stars of the log: some star was misread, or a place was passed unnoticed. So the log was mapped without stars and sides."
+# What is said where somebody ended the run before it was through.
+INTERRUPTED = "The run was interrupted: its map is the best one so far, and the log is mapped again by the next call."
 # Times between scans that are longer than so many times the usual one are gaps of the log, or clocks that jumped: they do not count as driving.
 GAP = 20.0
 
@@ -60,6 +61,7 @@ class LogMap:
     seconds   processor time of each stage, from the track on
     limit     seconds that there were for the minimal maps
     notes     what is to be said of how it was mapped
+    interrupted  whether somebody ended the run before it was through
     """
 
     log: RobotLog
@@ -69,6 +71,7 @@ class LogMap:
     seconds: Mapping[str, float]
     limit: float
     notes: tuple[str, ...] = ()
+    interrupted: bool = False
 
     @property
     def drove(self) -> float | None:
@@ -96,6 +99,7 @@ class LogMap:
             "notes": list(self.notes),
             "visits": len(self.imported.visits),
             "steps": len(trace),
+            "interrupted": self.interrupted,
             "status": solution.status.value,
             "complete": solution.complete,
             "count": solution.count,
@@ -138,6 +142,16 @@ def seconds_left(log: RobotLog, imported: Imported) -> float:
     return SHARE * drove - math.fsum(imported.seconds.values())
 
 
+class LogMapping(UnderWay):
+    """The mapping of a log that is under way. A handler of signals, or another thread, may end it, and ask what is known.
+
+    Attributes:
+        known: What is known once a search has begun, for a program that ends before the mapping is through.
+    """
+
+    known: Callable[[], LogMap]
+
+
 def map_log(
     log: RobotLog,
     theory: Theory | None = None,
@@ -150,6 +164,7 @@ def map_log(
     limit: float | None = None,
     maps: int = MAPS,
     with_ladder: bool = True,
+    mapping: LogMapping | None = None,
 ) -> LogMap:
     """The minimal maps of a building, from a robot's log.
 
@@ -160,28 +175,38 @@ def map_log(
     limit            seconds for the minimal maps; None for what is left of a twentieth of the time that the robot drove, and LEAST at least
     maps             so many of them are listed at most
     with_ladder      whether it is found out, too, what each kind of evidence is worth
+    mapping          what can interrupt this from elsewhere
 
-    Raises LogError, and TheoryError for a theory that does not suit the trace.
+    Ctrl-C during a search ends it, and what follows, with the best map so far: `interrupted` says so. Raises LogError, and TheoryError for a theory that does not suit the trace.
     """
+    mapping = mapping or LogMapping()
     imported = import_log(log, gateway, radius, name, doors)
     seconds = dict(imported.seconds)
     _log.info("%d visits, %d steps", len(imported.visits), len(imported.trace))
     chosen = (theory or theory_for(imported)).replace(**choices or {})
     left = seconds_left(log, imported)
     allowed = max(left * (1 - LADDER if with_ladder else 1), LEAST) if limit is None else limit
-    begin = time.process_time()
-    solution = solve(imported.trace, chosen, limit=allowed, maps=maps)
     notes: tuple[str, ...] = ()
+    climbed: list[Rung] = []
+
+    def outcome(solution: Solution, interrupted: bool = True) -> LogMap:
+        said = (*notes, INTERRUPTED) if interrupted else notes
+        return LogMap(log, imported, solution, tuple(climbed), dict(seconds), allowed, said, interrupted)
+
+    mapping.known = lambda: outcome(mapping.snapshot())
+    begin = time.process_time()
+    solution = mapping.solve(imported.trace, chosen, limit=allowed, maps=maps)
     if solution.status is Status.UNSATISFIABLE and theory is None and not {"star", "boundary", "level"} & set(choices or ()):
         bare = BARE.replace(**choices or {})
         if bare != chosen:
             chosen, notes = bare, (NO_STARS,)
-            solution = solve(imported.trace, chosen, limit=allowed, maps=maps)
+            solution = mapping.solve(imported.trace, chosen, limit=allowed, maps=maps)
+    mapping.known = lambda: outcome(solution)
     seconds["maps"] = round(time.process_time() - begin, 3)
-    climbed: tuple[Rung, ...] = ()
-    if with_ladder:
+    if with_ladder and not mapping.interrupted:
         begin, stars = time.process_time(), chosen.star != "none"
         share = (left - seconds["maps"]) / len(list(rungs(imported.trace, chosen, stars)))
-        climbed = tuple(ladder(imported.trace, chosen, limit=min(max(share, LEAST_RUNG), RUNG), maps=1, stars=stars, known=solution))
+        most = min(max(share, LEAST_RUNG), RUNG)
+        climbed += ladder(imported.trace, chosen, limit=most, maps=1, stars=stars, known=solution, under_way=mapping)
         seconds["ladder"] = round(time.process_time() - begin, 3)
-    return LogMap(log, imported, solution, climbed, seconds, allowed, notes)
+    return outcome(solution, mapping.interrupted)

@@ -18,7 +18,7 @@ from typing import Any
 
 from ssh_abduction.evaluation import Evaluation, evaluate, tells_names
 from ssh_abduction.solver.result import Solution
-from ssh_abduction.solver.search import solve
+from ssh_abduction.solver.search import Search
 from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Trace, checked_trace
 
@@ -57,6 +57,40 @@ class Rung:
         }
 
 
+class UnderWay:
+    """Searches that come one after the other. A handler of signals, or another thread, ends the one that is under way, and all that come after it.
+
+    Attributes:
+        search: The search that is under way or was the last one; None before the first.
+        interrupted: Whether somebody asked for an end.
+    """
+
+    def __init__(self) -> None:
+        self.search: Search | None = None
+        self.interrupted = False
+
+    def interrupt(self) -> None:
+        """End the search that is under way soon, with its best answer so far."""
+        self.interrupted = True
+        if self.search is not None:
+            self.search.interrupt()
+
+    def snapshot(self) -> Solution:
+        """What the search that is under way in another thread, which cannot be stopped, knows by now. It is of no use any more then."""
+        assert self.search
+        return self.search.snapshot("interrupted")
+
+    def solve(self, trace: Trace, theory: Theory, *, limit: float | None, maps: int) -> Solution:
+        """Do as `ssh_abduction.solve` does. Ctrl-C that ends this search ends the others, too."""
+        theory.check_steps(trace)
+        self.search = Search(trace, theory, limit=limit, maps=maps)
+        if self.interrupted:  # perhaps before there was a search to be told
+            self.search.interrupt()
+        solution = self.search.solution(tuple(self.search))
+        self.interrupted |= solution.stopped == "interrupted"
+        return solution
+
+
 def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[str, Theory]]:
     """The theories of the ladder, each with one kind of evidence more, as far as the trace has it."""
     jumped, theory = theory.jumped, theory.replace(star="none", displacement="none", planar=False, jumped=0)
@@ -82,17 +116,23 @@ def ladder(
     maps: int = 100,
     stars: bool = True,
     known: Solution | None = None,
+    under_way: UnderWay | None = None,
 ) -> Iterator[Rung]:
-    """The rungs of a trace, as they are solved.
+    """The rungs of a trace, as they are solved. A rung that is interrupted is the last one.
 
     theory  the other choices; Theory.topological() by default. What it says of stars, displacements and planarity is laid over
     limit   seconds for each rung
     maps    so many minimal maps, at most, are listed and evaluated on each rung
     stars   whether stars have a rung, where the trace has some
     known   a solution of this trace that is there already: the rung that has its theory takes it, and is not solved again
+    under_way  what can interrupt the ladder from elsewhere; Ctrl-C does so without
     """
+    under_way = under_way or UnderWay()
     checked_trace(trace)
     has_truth = tells_names(trace)
     for name, chosen in rungs(trace, checked_theory(theory), stars):
-        solution = known if known and known.theory == chosen.resolve(trace) else solve(trace, chosen, limit=limit, maps=maps)
-        yield Rung(name, solution, evaluate(solution.maps, trace) if has_truth and solution.maps else None)
+        solution = known if known and known.theory == chosen.resolve(trace) else under_way.solve(trace, chosen, limit=limit, maps=maps)
+        is_judged = has_truth and solution.maps and not under_way.interrupted
+        yield Rung(name, solution, evaluate(solution.maps, trace) if is_judged else None)
+        if under_way.interrupted:
+            return

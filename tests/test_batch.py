@@ -197,7 +197,7 @@ def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -
 def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler: str) -> None:
     deadly = Deadly(*(getattr(QUESTION, name) for name in Question.__slots__))
     paths = [f"{name}.jsonl" for name in ("quick", "deadly", "comb", "quick")]
-    stop = Stop(traces / "stop")
+    stop = Stop()
     for answers in (batch.here(deadly, paths, 2, stop), batch.on_cluster(deadly, paths, scheduler, None, stop)):
         lines = {answer.number: answer.line for answer in answers}
         assert sorted(lines) == [*range(len(paths))]
@@ -236,11 +236,11 @@ def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
 def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler: str) -> None:
     theory = Theory.topological().replace(boundary="none", path_order="partial", prefer=())
     endless = Question(theory, limit=1000, maps=0, memory=None, speedups=Speedups(), json=False)
-    answers = batch.on_cluster(endless, ["quick.jsonl", "slow.jsonl"], scheduler, None, Stop(traces / "stop"))
+    answers = batch.on_cluster(endless, ["quick.jsonl", "slow.jsonl"], scheduler, None, Stop())
     assert next(answers).number == 0
     time.sleep(0.5)  # the only thread of the worker is at the slow one
     answers.close()
-    assert [answer.code for answer in batch.on_cluster(QUESTION, ["comb.jsonl"], scheduler, None, Stop(traces / "stop"))] == [0]
+    assert [answer.code for answer in batch.on_cluster(QUESTION, ["comb.jsonl"], scheduler, None, Stop())] == [0]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forgets the peak of memory")

@@ -11,7 +11,7 @@ import truth
 
 from ssh_abduction import Odometry, Theory, Trace, solve
 from ssh_abduction.cli import main
-from ssh_abduction.rungs import ladder
+from ssh_abduction.rungs import UnderWay, ladder
 
 SQUARE = Trace.from_steps("ab" * 4 + "a", ["travel", "right"] * 4, displacements=[(10, 0, 0), (0, 0, -1.5708)] * 4)
 
@@ -41,6 +41,18 @@ def test_what_a_trace_does_not_have_is_no_rung() -> None:
 def test_what_is_solved_already_is_its_rung() -> None:
     known = solve(SQUARE)
     assert [rung.name for rung in ladder(SQUARE, known=known) if rung.solution is known] == ["+ geometry"]
+
+
+def test_a_ladder_that_is_interrupted_ends_with_the_rungs_so_far() -> None:
+    under_way = UnderWay()
+    names = []
+    for rung in ladder(SQUARE, under_way=under_way):
+        names.append(rung.name)
+        if len(names) == 2:
+            under_way.interrupt()
+    assert names == ["views", "+ pairs"]
+    (only,) = ladder(SQUARE, under_way=under_way)
+    assert (only.name, only.solution.stopped, only.evaluation) == ("views", "interrupted", None)
 
 
 def test_where_faults_are_allowed_planarity_is_no_rung() -> None:

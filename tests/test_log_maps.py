@@ -157,13 +157,13 @@ def test_flags_are_laid_over_the_theory_that_suits_the_walls(
 ) -> None:
     trace = replace(Trace.from_steps("ab", ["travel"]), extra={"right_angles": False})
 
-    def solve(_: Trace, theory: Theory, **__: object) -> None:
+    def solve(_: log_maps.LogMapping, __: Trace, theory: Theory, **___: object) -> None:
         raise SSHError(f"star={theory.star}, boundary={theory.boundary}")
 
     monkeypatch.setattr(
         log_maps, "import_log", lambda *_: SimpleNamespace(trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={})
     )
-    monkeypatch.setattr(log_maps, "solve", solve)
+    monkeypatch.setattr(log_maps.LogMapping, "solve", solve)
     small = hall.with_name("first.log")
     small.write_text("\n".join(hall.read_text().splitlines()[:20]) + "\n")
     assert main(["map", str(small), "-o", str(hall.with_name("never")), *flags]) == 1
@@ -235,7 +235,7 @@ def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_al
     question = MapQuestion(None, {}, (None, None, None), None, None, None, 1000.0, 1, False)
     small = tmp_path / "small.log"
     small.write_text("\n".join(hall.read_text().splitlines()[:160]) + "\n")
-    (answer,) = batch.here(question, [str(small)], 2, batch.Stop(tmp_path / "stop"))
+    (answer,) = batch.here(question, [str(small)], 2, batch.Stop())
     assert answer.code in (0, 10)
     assert dict(answer.files)["run.json"]
     lost = question.lost(workers.Lost(0, late=False), str(small))

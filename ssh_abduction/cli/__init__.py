@@ -52,6 +52,10 @@ MENDS = {
     errno.ENOSPC: "make room",
     errno.ENOENT: "make the folder first",
     errno.EACCES: "take a place that you may write to",
+    errno.EPERM: "take a place that you may write to",
+    errno.EROFS: "take a place that you may write to",
+    errno.EDQUOT: "make room",
+    errno.ENAMETOOLONG: "take a shorter name",
     errno.EEXIST: "take another name",
     errno.EISDIR: "take another name",
     errno.ENOTDIR: "take another name",
@@ -137,6 +141,17 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+def unwritten(error: OSError, output: object = "output") -> str:
+    """What is said of a file that cannot be written.
+
+    Args:
+        error: What the system says.
+        output: What was to be written, for errors that name no file.
+    """
+    mend = MENDS.get(error.errno or 0, "check the path")
+    return f"{named(error.filename or output)}: cannot be written: {error.strerror or error}; {mend}"
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code. SystemExit, with code 2, for wrong usage."""
     try:
@@ -185,8 +200,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        mend = MENDS.get(error.errno or 0, "check the path")
-        print(f"ssh-abduction: {named(error.filename or 'output')}: cannot be written: {error.strerror or error}; {mend}", file=sys.stderr)
+        print(f"ssh-abduction: {unwritten(error)}", file=sys.stderr)
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_ERROR

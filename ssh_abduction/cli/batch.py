@@ -12,7 +12,6 @@ import gc
 import logging
 import re
 import sys
-import tempfile
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -78,17 +77,17 @@ class Answer(NamedTuple):
     warnings: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
 class Stop:
-    """Whether all is to stop, which this file says: so other processes hear of it, too."""
+    """Whether all is to stop. A handler of signals may say so at any time, which an Event of `threading` does not allow."""
 
-    file: Path
+    def __init__(self) -> None:
+        self._is_set = False
 
     def set(self) -> None:
-        self.file.touch()
+        self._is_set = True
 
     def is_set(self) -> bool:
-        return self.file.exists()
+        return self._is_set
 
 
 def in_a_line(error: Exception) -> str:
@@ -106,6 +105,10 @@ class Asked(Protocol):
     @property
     def has_limits(self) -> bool:
         """Whether it takes a process of its own to answer, as that may have to be ended."""
+
+    @property
+    def patience(self) -> float:
+        """Seconds that an answer may take once all is to stop."""
 
     def load(self, path: str) -> Any:
         """What goes along to a worker. Whatever it raises is the answer."""
@@ -206,12 +209,18 @@ class Question:
             line = dump({"trace": path, **opening(search), "maps": maps_told, **ending(search, solution, explanation, count, backbone)})
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
-        return Answer(number, line, exit_code(solution), tuple(warnings_of(search, solution)))
+        warnings = tuple(f"{named(path)}: {warning}" for warning in warnings_of(search, solution))
+        return Answer(number, line, exit_code(solution), warnings)
 
     @property
     def overdue(self) -> float | None:
         """Seconds after which a process that was to answer is taken for lost."""
         return None if self.limit is None else GUARDED * self.limit + OVERDUE
+
+    @property
+    def patience(self) -> float:
+        """Seconds that an answer may take once all is to stop."""
+        return OVERDUE
 
     def lost(self, lost: workers.Lost, path: str) -> Answer:
         """The answer for a trace whose process ended without one."""
@@ -234,15 +243,13 @@ def run(options: argparse.Namespace) -> int:
     if options.scheduler or options.jobs not in (None, 1):
         speedups = replace(speedups, threads=False)  # the processors have other traces to solve
     question = Question(theory_of(options), options.time_limit, options.maps, options.memory_limit, speedups, options.json, options.within)
-    with tempfile.TemporaryDirectory() as folder:
-        stop = Stop(Path(folder) / "stop")
-        if options.scheduler is None:
-            answers = here(question, paths, options.jobs or 1, stop)
-        else:
-            answers = on_cluster(question, paths, options.scheduler, options.jobs, stop)
-        codes = _printed(answers, len(paths), stop)
-        stopped = stop.is_set()
-    if stopped:
+    stop = Stop()
+    if options.scheduler is None:
+        answers = here(question, paths, options.jobs or 1, stop)
+    else:
+        answers = on_cluster(question, paths, options.scheduler, options.jobs, stop)
+    codes = _printed(answers, len(paths), stop)
+    if stop.is_set():
         missing = len(paths) - sum(code <= SIGNALLED for code in codes)
         print(f"ssh-abduction: interrupted: {missing} of {len(paths)} traces not finished", file=sys.stderr)
         return interrupted_code()
@@ -297,8 +304,11 @@ def here(question: Asked, paths: Sequence[str], jobs: int, stop: Stop) -> Genera
     tasks = [(number, path, question) for number, path in enumerate(paths)]
     processes = min(effective_n_jobs(jobs), len(paths))
     with on_ctrl_c(end):
-        for answer in workers.answers(_solved_in_worker, tasks, processes, stop.is_set, question.overdue, OVERDUE):
-            yield question.lost(answer, paths[answer.number]) if isinstance(answer, workers.Lost) else answer
+        for answer in workers.answers(_solved_in_worker, tasks, processes, stop.is_set, question.overdue, question.patience):
+            if not isinstance(answer, workers.Lost):
+                yield answer
+            elif not stop.is_set():  # one that is given up has no answer, and that is no error
+                yield question.lost(answer, paths[answer.number])
 
 
 def on_cluster(question: Asked, paths: Sequence[str], address: str, jobs: int | None, stop: Stop) -> Generator[Any]:
@@ -395,7 +405,7 @@ def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
         return question.answer(number, path, content, given_up)
     # Other traces may be under way in this process, which cannot be ended with one that does not heed its limits.
     work = [(number, path, question, content)]
-    answer: Any = next(workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, OVERDUE))
+    answer: Any = next(workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, question.patience))
     return question.lost(answer, path) if isinstance(answer, workers.Lost) else answer
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from ssh_abduction import program
 from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.outcome import dump
 from ssh_abduction.cli.text import table
@@ -36,7 +37,8 @@ def _as_text(front: Front, most: int) -> str:
     elif len(front.points) > most:
         lines.append("no knee: each further fault saves about as many dstates")
     if len(front.points) <= most:
-        lines.append(f"stopped at {front.points[-1].faults} faults by the time limit")
+        why = "interrupted" if program.raised else "stopped by the time limit"
+        lines.append(f"{why} at {front.points[-1].faults} faults")
     return "\n".join(lines)
 
 

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 # Those of perception.readers.logs, which would take long to load before it is known what is asked.
 FORMATS = ("carmen", "g2o", "ros1", "ros2", "mcap")
 PLACES = ("junctions", "doors")
+# What the name of a file ends in that says how it is packed, and then what is in it.
+ENDINGS = ("gz", "bz2", "xz", "zst", "zstd", "lz4"), ("log", "clf", "carmen", "txt", "g2o", "graph", "toro", "bag", "mcap", "db3")
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -100,8 +102,15 @@ def doors_of(options: argparse.Namespace) -> bool | None:
 
 
 def named_after(path: str) -> str:
-    """The name of a trace that is made of the log in a file."""
-    return Path(path).name.partition(".")[0]
+    """The name of a trace that is made of a log, and of the folder of its map: that of the file, without what says how it is written."""
+    name = Path(path).name
+    if not name.strip("."):
+        name = Path(path).resolve().name
+    for endings in ENDINGS if not Path(path).is_dir() else ():
+        stem, _, ending = name.rpartition(".")
+        if ending.lower() in endings and stem.strip("."):
+            name = stem
+    return name if name.strip(".") else "log"
 
 
 def damage(log: RobotLog) -> list[str]:

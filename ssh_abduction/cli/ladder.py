@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from ssh_abduction.asp.limits import Stop
+from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.cli.outcome import on_ctrl_c
 from ssh_abduction.cli.text import table
 from ssh_abduction.files import json_line
+from ssh_abduction.program import interrupted_code
 from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
     from ssh_abduction.rungs import Rung
 
 UNKNOWN = "–"
+HEAD = ("", "minimal maps", "dstates", "places", "paths", "the true one", "accuracy", "seconds")
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -34,17 +40,27 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.rungs import ladder  # loads scipy
+    from ssh_abduction.rungs import UnderWay, ladder  # loads scipy
 
-    trace = Trace.load(options.trace)
+    trace, theory = Trace.load(options.trace), theory_of(options)
     rungs: list[Rung] = []
-    for rung in ladder(trace, theory_of(options), limit=options.time_limit, maps=options.maps):
-        rungs.append(rung)
-        if options.json:
-            print(json_line(rung.to_dict()), flush=True)
-    if not options.json:
-        print(table(("", "minimal maps", "dstates", "places", "paths", "the true one", "accuracy", "seconds"), list(map(_row, rungs))))
-    return 0
+    under_way = UnderWay()
+
+    def told() -> str:
+        """What is still to be printed: the table, where each rung is not printed as it comes."""
+        return "" if options.json else f"{table(HEAD, list(map(_row, rungs)))}\n"
+
+    def last_words(_: Stop) -> tuple[str, int]:
+        return told(), interrupted_code()
+
+    with on_ctrl_c(under_way.interrupt), Guard(under_way.interrupt, last_words, None, None) as guard:
+        for rung in ladder(trace, theory, limit=options.time_limit, maps=options.maps, under_way=under_way):
+            rungs.append(rung)
+            if options.json:
+                guard.say(lambda: f"{json_line(rungs[-1].to_dict())}\n")
+                sys.stdout.flush()
+        guard.say(told)
+    return interrupted_code() if under_way.interrupted else 0
 
 
 def _row(rung: Rung) -> list[object]:
