@@ -19,13 +19,13 @@ from typing import Any
 
 import dask
 import pytest
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
 from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Speedups, Theory, Trace
 from ssh_abduction.asp import workers
 from ssh_abduction.cli import batch, main, mapping
-from ssh_abduction.cli.batch import Answer, Question, Stop
+from ssh_abduction.cli.batch import Absence, Answer, Question, Stop
 from ssh_abduction.cli.mapping import MapAnswer, MapQuestion
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -178,6 +178,43 @@ def test_a_scheduler_without_workers(traces: Path, monkeypatch: pytest.MonkeyPat
     with LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster:
         assert main(["solve", "quick.jsonl", "--scheduler", cluster.scheduler_address]) == 1
     assert re.fullmatch(r"ssh-abduction: --scheduler: expected a worker, got none in 2 s; start one with: .*\n", capsys.readouterr().err)
+
+
+def test_a_cluster_whose_workers_are_gone_is_waited_for_as_long_as_the_limit(
+    traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(batch, "PATIENCE", 0.1)
+    monkeypatch.setattr(batch, "LOOK", 0.0)
+    monkeypatch.setattr(Client, "wait_for_workers", lambda *_, **__: None)  # there was one
+    with LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster:
+        address = cluster.scheduler_address
+        assert main(["solve", "quick.jsonl", "comb.jsonl", "quick.jsonl", "--time-limit", "0.3", "--scheduler", address]) == 1
+    out, err = capsys.readouterr()
+    told = rf"scheduler: expected a worker, got none for \d s; start one with: dask worker {address}"
+    assert all(re.fullmatch(rf"\w+.jsonl: error: {told}", line) for line in out.splitlines())
+    assert len(out.splitlines()) == 3
+    assert re.fullmatch(rf"ssh-abduction: warning: {told}, or end this with Ctrl-C", err.splitlines()[0])
+    assert err.count("warning") == 1
+
+
+@pytest.mark.parametrize(("limit", "ends"), [(None, None), (5, 10), (25, 25)])
+def test_how_long_a_cluster_may_have_no_worker(limit: float | None, ends: float | None, capsys: pytest.CaptureFixture[str]) -> None:
+    """A worker is there for 40 s, and comes back once, after 100 s."""
+    now = 0.0
+
+    def workers() -> int:
+        if now == 50:
+            raise OSError("the scheduler does not answer")
+        return int(now <= 40 or now == 100)
+
+    absence = Absence(workers, limit, "tcp://here:1", lambda: now)
+    too_long, said = [], []
+    for second in range(140):
+        now = float(second)
+        too_long += [second] if absence.is_too_long() else []
+        said += [second] if capsys.readouterr().err else []
+    assert said == [50, 110]
+    assert too_long == ([] if ends is None else [*range(40 + int(ends), 100), *range(100 + int(ends), 140)])
 
 
 def test_without_the_extra(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

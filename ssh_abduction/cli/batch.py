@@ -12,16 +12,17 @@ import gc
 import logging
 import re
 import sys
+import time
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 from ssh_abduction.asp import workers
+from ssh_abduction.asp.limits import POLL
 from ssh_abduction.asp.limits import Stop as SearchStop
 from ssh_abduction.cli import EXIT_ERROR
 from ssh_abduction.cli.guard import Guard
@@ -58,6 +59,7 @@ Task: TypeAlias = tuple[int, str]  # the number of a trace, and its path
 
 PATIENCE = 10  # seconds for a Dask scheduler, and for its first worker, to answer
 KILLED = "process: expected an answer, got killed, as happens when memory runs out; set --memory-limit, or solve fewer traces at a time"
+LOOK = 1.0  # seconds between two looks at whether the cluster still has a worker
 GUARDED, OVERDUE = (
     1.2,
     3.0,
@@ -105,6 +107,10 @@ class Asked(Protocol):
     @property
     def has_limits(self) -> bool:
         """Whether it takes a process of its own to answer, as that may have to be ended."""
+
+    @property
+    def limit(self) -> float | None:
+        """Seconds for the search of each file, or None."""
 
     @property
     def patience(self) -> float:
@@ -330,8 +336,9 @@ def on_cluster(question: Asked, paths: Sequence[str], address: str, jobs: int | 
             client.wait_for_workers(1, timeout=PATIENCE)
         except TimeoutError:
             raise SSHError(f"--scheduler: expected a worker, got none in {PATIENCE} s; start one with: dask worker {address}") from None
-        most = jobs if jobs is not None and jobs > 0 else 2 * sum(client.ncores().values())
-        for answer in _answers(question, paths, partial(_on_workers, question, client, most)):
+        most = jobs if jobs is not None and jobs > 0 else max(1, 2 * sum(client.ncores().values()))
+        absence = Absence(lambda: len(client.ncores()), question.limit, address)
+        for answer in _answers(question, paths, partial(_on_workers, question, client, most, absence)):
             yield answer
             if stop.is_set():
                 return
@@ -352,7 +359,45 @@ def _answers(question: Asked, paths: Sequence[str], attempt: Callable[[list[Task
             yield question.failed(*task, SolverError(KILLED))
 
 
-def _on_workers(question: Asked, client: Client, most: int, tasks: list[Task], killed: list[Task]) -> Iterator[Any]:
+class Absence:
+    """How long a cluster has had no worker. Dask itself waits without a word.
+
+    After PATIENCE seconds a warning says so. Where there is a time limit, the wait is too long after so many seconds, or PATIENCE, if that is more.
+
+    Args:
+        workers: Tells how many workers there are.
+        limit: Seconds, or None.
+        address: The address of the scheduler, which the sentences name.
+        clock: Tells the time in seconds.
+    """
+
+    def __init__(self, workers: Callable[[], int], limit: float | None, address: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._workers, self._limit, self._clock, self._address = workers, limit, clock, address
+        self._looks_at = self._last_seen = clock()
+        self._warned = False
+
+    @property
+    def sentence(self) -> str:
+        """What is said of it."""
+        seconds = self._clock() - self._last_seen
+        return f"scheduler: expected a worker, got none for {seconds:.0f} s; start one with: dask worker {self._address}"
+
+    def is_too_long(self) -> bool:
+        """Look, now and then, whether there is a worker, and warn once if there is none. Returns whether nobody should wait any longer."""
+        now = self._clock()
+        if now >= self._looks_at:
+            self._looks_at = now + LOOK
+            with contextlib.suppress(Exception):  # of a scheduler that is gone
+                if self._workers():
+                    self._last_seen, self._warned = now, False
+        absent = now - self._last_seen
+        if absent >= PATIENCE and not self._warned:
+            self._warned = True
+            warn([f"{self.sentence}, or end this with Ctrl-C"])
+        return self._limit is not None and absent >= max(PATIENCE, self._limit)
+
+
+def _on_workers(question: Asked, client: Client, most: int, absence: Absence, tasks: list[Task], killed: list[Task]) -> Iterator[Any]:
     """An attempt on Dask, with so many traces at most sent at a time. They are read here: workers need not share the disk.
 
     This is Dask's own interface, as joblib's backend for Dask waits for ever when a worker is killed.
@@ -362,8 +407,21 @@ def _on_workers(question: Asked, client: Client, most: int, tasks: list[Task], k
     sent: dict[Future[Any], Task] = {}
     ready = as_completed(loop=client.loop)
 
-    def received(futures: Iterable[Future[Any]]) -> Iterator[Any]:
-        for future in futures:
+    def received(left: int) -> Iterator[Any]:
+        """Answers, until no more than `left` traces are under way."""
+        while len(sent) > left:
+            if ready.is_empty():  # the scheduler is gone
+                return
+            if not ready.has_ready():
+                if not absence.is_too_long():
+                    time.sleep(POLL)
+                    continue
+                for future, task in sent.items():
+                    future.cancel()
+                    yield question.failed(*task, SolverError(absence.sentence))
+                sent.clear()
+                return
+            future = next(ready)
             task = sent.pop(future)
             try:
                 yield future.result()
@@ -379,14 +437,16 @@ def _on_workers(question: Asked, client: Client, most: int, tasks: list[Task], k
         try:
             if client.status != "running":
                 raise SolverError(LOST)
+            if absence.is_too_long():
+                raise SolverError(absence.sentence)
             future = client.submit(_on_worker, question, number, path, question.load(path), pure=False)
         except Exception as error:
             yield question.failed(number, path, error)
             continue
         sent[future] = number, path
         ready.add(future)
-        yield from received(islice(ready, max(0, len(sent) + 1 - most)))
-    yield from received(ready)
+        yield from received(most - 1)
+    yield from received(0)
     for task in sent.values():  # Dask says nothing about these once the scheduler is gone
         yield question.failed(*task, SolverError(LOST))
 
