@@ -292,7 +292,7 @@ class Localiser:
             return
         if all(step.view is None for step in trace):
             raise TraceError(
-                f"{named(trace.source or 'trace')}: view: expected the views of the map, got images only; give a recogniser (--recogniser) that was trained on the map's labels"
+                f"{named(trace.source or 'trace')}: view: expected the views of the map, got images only; train a recogniser on the map's labels, and give it to localize --recogniser"
             )
         yield from (self._of_view(step.view) for step in trace)
 

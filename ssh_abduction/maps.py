@@ -471,7 +471,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     try:
         text = sys.stdin.buffer.read(LARGEST + 1) if str(path) == "-" else _read_at_most(path, LARGEST)
         if len(text) > LARGEST:
-            raise MapError(f"{source}: expected at most {LARGEST // 2**20} MiB, got more; list fewer maps (--maps)")
+            raise MapError(f"{source}: expected at most {LARGEST // 2**20} MiB, got more; list fewer (solve --maps)")
         if not text.strip():
             raise MapError(f"{source}: expected JSON, got an empty file; write it with solve --json")
         return parse_json(text.decode("utf-8"))
@@ -480,7 +480,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     except OSError as error:
         raise MapError(f"{source}: expected a readable file of maps: {error.strerror or error}; check the path") from None
     except MemoryError:
-        raise MapError(f"{source}: expected a file of maps that fits into memory, got a larger one; list fewer maps (--maps)") from None
+        raise MapError(f"{source}: expected a file of maps that fits into memory, got a larger one; list fewer (solve --maps)") from None
     except json.JSONDecodeError as error:
         if text.startswith(b'{"format": "ssh-trace"'):
             raise MapError(f"{source}: expected maps, got a trace; name the two files in the other order, or solve it first") from None

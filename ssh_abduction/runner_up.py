@@ -52,7 +52,7 @@ class SecondMap:
             other = "have no map" if self.solution.status is Status.UNSATISFIABLE else "have no map that was found in time"
         return (
             f"{self.views} views may be too {'few' if self.views < self.other_views else 'many'}: {self.other_views} also separate the images well, "
-            f"and {other}; cluster the images into {self.other_views} views to see it (--k {self.other_views}), or log more images"
+            f"and {other}; cluster the images into {self.other_views} views to see it (cluster --k {self.other_views}), or log more images"
         )
 
 

@@ -219,7 +219,7 @@ class Step:
         if openings is None:
             raise TraceError(
                 f"star: expected bearings that fall into different quarters (ahead, right, back, left), each near its middle and observed, "
-                f"got {brief(_star_to_json(star))}; merge the openings that share a quarter, or take star=gateways (--star gateways)"
+                f"got {brief(_star_to_json(star))}; merge the openings that share a quarter, or take star=gateways (solve --star gateways)"
             )
         return openings
 

@@ -356,7 +356,7 @@ def _answers(question: Asked, paths: Sequence[str], attempt: Callable[[list[Task
         again: list[Task] = []
         yield from attempt([task], again)
         for _ in again:
-            yield question.failed(*task, SolverError(KILLED))
+            yield question.lost(workers.Lost(task[0], late=False), task[1])
 
 
 class Absence:

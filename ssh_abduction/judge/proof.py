@@ -40,9 +40,9 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
     all, the word of a pair is what was done after both steps. Raises MapError where the certificate is malformed.
     """
     if not isinstance(certificate, Mapping):
-        raise MapError(f"certificate: expected an object, got {brief(certificate)}; solve the trace again with --json")
+        raise MapError(f"certificate: expected an object, got {brief(certificate)}; write it with solve --json")
     if "clique" not in certificate:
-        raise MapError("certificate: clique: expected one, got none; solve the trace again with --json")
+        raise MapError("certificate: clique: expected one, got none; write it with solve --json")
     steps, words, refuted = (certificate.get(name, []) for name in ("clique", "words", "refuted"))
     if not _integers(steps) or not all(0 <= step < len(trace) for step in steps) or len(set(steps)) < len(steps):
         raise MapError(f"certificate: clique: expected different steps, 0 to {len(trace) - 1}, got {brief(steps)}")
