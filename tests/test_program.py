@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import os
+import signal
 import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import pytest
 from aces import ACES
 
-from ssh_abduction import program
+from ssh_abduction import Solution, SSHError, Theory, Trace, program
 from ssh_abduction.asp import process, workers
 from ssh_abduction.asp.limits import Watch
+from ssh_abduction.cli import main
+from ssh_abduction.log_maps import LogMapping
+from ssh_abduction.reproduce import report
+from ssh_abduction.rungs import UnderWay
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="sends signals, which Windows has none of")
 SOON = 60  # seconds in which what has to end soon has ended also on a slow machine that has much else to do
@@ -94,3 +103,126 @@ def test_where_modules_are_looked_for(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir(Path(program.__file__).parents[1])  # as in a checkout
     with patch.object(sys, "path", ["", "/lib"]):
         assert program.search_path() == ["", "/lib"]
+
+
+# A verb that sits in clingo, which cannot be stopped and hears nothing.
+DEAF = """
+import sys, clingo
+from ssh_abduction import __main__
+from ssh_abduction.cli import facts
+def run(options):
+    print("ready", flush=True)
+    control = clingo.Control()
+    control.add("p(0). p(X+1) :- p(X), X < 1000000000.")
+    control.ground()
+facts.run = run
+__main__.run()
+"""
+
+
+@POSIX
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_verb_that_hears_nothing_is_ended_with_the_code_of_the_signal(number: int, code: int) -> None:
+    with subprocess.Popen([sys.executable, "-c", DEAF, "facts", ACES], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        assert process.wait(SOON) == code
+
+
+@pytest.fixture
+def signals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The signals that other tests sent are forgotten, and so are those of this test."""
+    for name in ("heard", "raised"):
+        monkeypatch.setattr(program, name, [])
+
+
+@POSIX
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_ladder_prints_the_rungs_so_far(
+    number: int, code: int, signals: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    solve, asked = UnderWay.solve, []
+
+    def solve_until_the_second(under_way: UnderWay, trace: Trace, theory: Theory, **limits: Any) -> Solution:
+        asked.append(theory)
+        if len(asked) == 2:
+            os.kill(os.getpid(), number)
+        return solve(under_way, trace, theory, **limits)
+
+    monkeypatch.setattr(UnderWay, "solve", solve_until_the_second)
+    assert main(["ladder", ACES, "--maps", "1", "--json"]) == code
+    rungs = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [rung["name"] for rung in rungs] == ["views", "+ star"]
+    assert [rung["status"] == "optimal" for rung in rungs] == [True, False]
+
+
+@POSIX
+def test_map_that_is_interrupted_says_so_and_is_done_again(
+    tmp_path: Path, signals: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, runs = tmp_path / "drive.log", tmp_path / "runs"
+    assert main(["simulate", "notched-rectangle", "--as", "carmen", "--every", "0.5", "-q", "-o", str(log)]) == 0
+    solve = LogMapping.solve
+
+    def solve_until_a_signal(mapping: LogMapping, *trace: Any, **limits: Any) -> Solution:
+        solution = solve(mapping, *trace, **limits)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return solution
+
+    with monkeypatch.context() as patched:
+        patched.setattr(LogMapping, "solve", solve_until_a_signal)
+        assert main(["map", str(log), "-o", str(runs)]) == 143
+    assert "The run was interrupted" in capsys.readouterr().err
+    run = json.loads((runs / "run.json").read_text())
+    assert (run["interrupted"], run["ladder"], run["status"]) == (True, [], "optimal")
+    assert "The run was interrupted" in (runs / "report.html").read_text()
+    assert Solution.load(runs / "maps.json").maps
+    assert main(["map", str(log), "-o", str(runs), "--no-ladder"]) == 0
+    assert json.loads((runs / "run.json").read_text())["interrupted"] is False
+    assert main(["map", str(log), "-o", str(runs), "--no-ladder"]) == 0
+    assert "done already" in capsys.readouterr().out
+
+
+def leave_a_temporary_file(number: int, there: str, given_up: Callable[[], bool]) -> None:
+    """Tell where the temporary files of this process lie, and wait."""
+    folder = tempfile.mkdtemp()
+    Path(there).write_text(folder)
+    while not given_up():
+        time.sleep(0.05)
+
+
+@POSIX
+def test_temporary_files_of_workers_go_with_them(tmp_path: Path) -> None:
+    """Also where their parent is killed."""
+    told = tmp_path / "told"
+    script = f"""
+from ssh_abduction.asp import workers
+from test_program import leave_a_temporary_file
+list(workers.answers(leave_a_temporary_file, [(0, {str(told)!r})], 1, lambda: False, None, 1.0))
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(tmp_path)}
+    with subprocess.Popen([sys.executable, "-c", script], env=environment) as parent:
+        until(lambda: told.exists() and bool(told.read_text()))
+        assert Path(told.read_text()).is_relative_to(tmp_path)
+        parent.kill()
+    until(lambda: not Path(told.read_text()).exists())
+    until(lambda: list(tmp_path.iterdir()) == [told])
+
+
+def test_work_in_processes_gives_results_in_order_and_raises_what_it_raises() -> None:
+    found = report._each(divmod, [(9, i) for i in (4, 3, 2, 1, 0)], 2)
+    assert [next(found) for _ in range(4)] == [(2, 1), (3, 0), (4, 1), (9, 0)]
+    with pytest.raises(ZeroDivisionError):
+        next(found)
+    assert list(report._each(divmod, [(9, 4)], 2)) == [(2, 1)]
+    with pytest.raises(SSHError, match="expected an answer, got killed"):
+        list(report._each(os._exit, [(0,), (0,)], 2))
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait until something has come about."""
+    ends = time.monotonic() + SOON
+    while not condition():
+        assert time.monotonic() < ends
+        time.sleep(0.02)

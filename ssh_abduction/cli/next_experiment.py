@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from ssh_abduction.asp.limits import Watch, check_limit
+from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.text import table
@@ -67,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
         watch.interrupted = True
 
     try:
-        with on_ctrl_c(interrupt):
+        with on_ctrl_c(interrupt), Guard(interrupt, lambda _: ("", interrupted_code()), None, None):
             experiment = next_experiment(
                 maps,
                 trace,
