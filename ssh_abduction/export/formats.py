@@ -97,7 +97,7 @@ def doubts(ssh_map: SSHMap, to: str, *, level: str | None = None, turns: Trace |
     if not roads.metric:
         found.append("the map has no poses: its positions are of a layout, and no metres; solve a trace with displacements")
     if together := roads.together:
-        mend = "export places (--level places)" if ssh_map.places else "solve with places (--theory topological)"
+        mend = "export places (export --level places)" if ssh_map.places else "solve with places (solve --theory topological)"
         found.append(
             f"{together} of {len(roads.stops)} {level} share their position with others: "
             f"programs that look nodes up by position may take a wrong one; {mend}"
