@@ -15,6 +15,7 @@ from sklearn.base import BaseEstimator, OneToOneFeatureMixin, TransformerMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from perception.errors import ImageWarning, PerceptionError, equal_length
+from ssh_abduction.errors import is_finite
 
 
 class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]
@@ -32,7 +33,7 @@ class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimato
 
     def fit(self, X: ArrayLike, y: Any = None) -> Self:
         """Learn the number of beams, and nothing else."""
-        if not (isinstance(self.floor, int | float | np.number) and 0 < self.floor < np.inf):
+        if not is_finite(self.floor) or self.floor <= 0:
             raise PerceptionError(f"floor: expected a positive number of metres, got {self.floor!r}")
         validate_data(self, equal_length(X), dtype=np.float64, ensure_all_finite=False)
         return self

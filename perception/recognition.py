@@ -23,6 +23,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.reciprocal import ReciprocalTransformer
+from ssh_abduction.errors import brief
 
 
 class PlaceRecognizer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
@@ -90,8 +91,16 @@ def recogniser(floor: float = 0.05, n_neighbors: int = 1, features: Any = None) 
     floor     of the reciprocals of ranges in metres, which are the features where no others are given
     features  a transformer of scikit-learn's kind for other images, such as a PanoramaTransformer. It is cloned
     """
-    made = ("reciprocal", ReciprocalTransformer(floor)) if features is None else ("features", clone(features))
+    made = ("reciprocal", ReciprocalTransformer(floor)) if features is None else ("features", cloned("features", features, "transform"))
     return Pipeline([made, ("nearest", PlaceRecognizer(n_neighbors))])
+
+
+def cloned(name: str, estimator: Any, *methods: str) -> Any:
+    """A clone of an estimator of scikit-learn's kind, which has `fit` and these methods. Raises PerceptionError for anything else."""
+    wanted = ("fit", "get_params", *methods)
+    if isinstance(estimator, type) or not all(hasattr(estimator, method) for method in wanted):
+        raise PerceptionError(f"{name}: expected an estimator with {', '.join(wanted)}, got {brief(estimator)}; make one of scikit-learn's")
+    return clone(estimator)
 
 
 @dataclass(frozen=True)

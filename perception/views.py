@@ -27,6 +27,8 @@ from threadpoolctl import threadpool_limits
 from perception.confidence import NOISE, confidence
 from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.quality import cluster_quality, sampled, spanning_tree, trimmed_quality
+from ssh_abduction.checks import a_whole_number
+from ssh_abduction.errors import brief, is_finite
 
 # Up to this many images all starts of k-means are made on all images. Where there are more, the starts are made on a sample of this many, so that the time for
 # them does not grow any further.
@@ -41,6 +43,8 @@ APART = 2.3
 EQUAL = 0.95
 # Which image is isolated is told by its third nearest neighbour, so that two or three that show the same stranger are isolated, too.
 NEIGHBOURS = 3
+# More starts of k-means than this are a mistake: each takes as long as the first.
+MOST_STARTS = 10_000
 # For which `isolated` the loop takes images to be noise where views may be disbelieved. docs/reproduction.md has what it rests on.
 ISOLATED = 10.0
 
@@ -253,9 +257,15 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 continue
             if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
                 raise PerceptionError(f"{name}: expected a whole number of at least {least}, got {value!r}")
-        if self.by not in ("M", "trimmed"):
+        if self.n_init > MOST_STARTS:
+            raise PerceptionError(f"n_init: expected at most {MOST_STARTS} starts, got {brief(self.n_init)}; a few dozen are many")
+        if self.random_state is not None and not isinstance(self.random_state, np.random.RandomState):
+            a_whole_number(
+                "random_state", self.random_state, PerceptionError, 0, 2**32 - 1, what="a seed", mend="give a seed, a RandomState or None"
+            )
+        if not isinstance(self.by, str) or self.by not in ("M", "trimmed"):
             raise PerceptionError(f'by: expected "M" or "trimmed", got {self.by!r}')
-        if self.isolated is not None and not (isinstance(self.isolated, int | float | np.number) and 1 < self.isolated < math.inf):
+        if self.isolated is not None and not (is_finite(self.isolated) and self.isolated > 1):
             raise PerceptionError(f"isolated: expected a number of more than 1, or None, got {self.isolated!r}")
         if self.k is None and self.k_max is not None and self.k_max < self.k_min:
             raise PerceptionError(f"k_max: expected at least k_min = {self.k_min}, got {self.k_max}")

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from simulator.errors import SimulatorError
 from simulator.laser import meetings
 from simulator.motion import Pose
-from simulator.world import World
+from simulator.world import World, checked_segments, pose_of
+from ssh_abduction.checks import a_flag, a_list, a_number, a_whole_number, an_instance
 from ssh_abduction.errors import brief, is_finite, is_whole
 
 Array = NDArray[np.float64]
@@ -75,8 +76,14 @@ class Paint:
     seed: int = 0
     repeated: bool = False
 
+    def __post_init__(self) -> None:
+        a_whole_number("paint.seed", self.seed, SimulatorError)
+        a_flag("paint.repeated", self.repeated, SimulatorError)
+
     def keys(self, segments: Array, walls: int) -> list[tuple[Any, ...]]:
         """What names the texture of each segment, of which the first so many are walls and the others clutter, which moves."""
+        checked_segments("segments", segments)
+        a_whole_number("walls", walls, SimulatorError)
         ways = segments[:, 2:] - segments[:, :2]
         lengths = np.maximum(np.hypot(*ways.T), 1e-9)
         degrees = np.round(np.degrees(np.arctan2(ways[:, 1], ways[:, 0]))).astype(int) % 360
@@ -91,6 +98,7 @@ class Paint:
 
     def texture(self, key: tuple[Any, ...]) -> Array:
         """The numbers of a texture, (13 + 6 WAVES,): see `_albedo`."""
+        an_instance("key", key, tuple, SimulatorError, mend="take one of Paint.keys")
         rng = np.random.default_rng([self.seed, zlib.crc32(repr(key).encode())])
         base, stripe, skirting = rng.uniform(0.25, 0.75, 3), rng.uniform(0.15, 0.85, 3), rng.uniform(0.1, 0.4, 3)
         stripes = [rng.uniform(0.5, 1.2), rng.uniform(0.2, 0.5), rng.uniform(0, 1), rng.uniform(0.1, 0.3)]
@@ -122,9 +130,14 @@ class Camera:
         for name in ("rows", "columns"):
             if not is_whole(getattr(self, name)) or not 1 <= getattr(self, name) <= 1000:
                 raise SimulatorError(f"camera.{name}: expected a whole number from 1 to 1000, got {brief(getattr(self, name))}; change it")
+        an_instance("camera.paint", self.paint, Paint, SimulatorError, mend="make one with Paint()")
+        hours = tuple(a_list("camera.hours", self.hours, SimulatorError, what="the hours at which a run begins and ends"))
+        if len(hours) != 2:
+            raise SimulatorError(f"camera.hours: expected two, at which a run begins and ends, got {brief(self.hours)}; give both")
+        object.__setattr__(self, "hours", hours)
         for name, value, most in (
-            ("hours", self.hours[0], 24.0),
-            ("hours", self.hours[-1], 24.0),
+            ("hours", hours[0], 24.0),
+            ("hours", hours[1], 24.0),
             ("noise", self.noise, 255.0),
             ("exposure", self.exposure, 1.0),
         ):
@@ -138,6 +151,7 @@ class Camera:
 
     def hour(self, share: float) -> float:
         """The hour when a share of the run is over."""
+        a_number("share", share, SimulatorError, 0, 1, what="a share")
         return self.hours[0] + share * (self.hours[1] - self.hours[0])
 
     def shot(self, world: World, pose: Pose, rng: np.random.Generator, hour: float = 12.0, walls: int | None = None) -> NDArray[np.uint8]:
@@ -145,7 +159,8 @@ class Camera:
 
         walls  how many segments of the world are walls, where the others are clutter; None for all of them
         """
-        light = Light.at(hour)
+        an_instance("rng", rng, np.random.Generator, SimulatorError, mend="take numpy.random.default_rng(0)")
+        light = Light.at(a_number("hour", hour, SimulatorError, 0, 24))
         scene = self.scene(world, pose, light, walls).reshape(self.rows, DOWN, self.columns, ACROSS, 3).mean(axis=(1, 3))
         values = WHITE_VALUE * scene * (GREY_VALUE / (WHITE_VALUE * scene.mean())) ** self.exposure
         noisy = values + rng.normal(0, self.noise, values.shape) if self.noise else values
@@ -154,6 +169,9 @@ class Camera:
 
     def scene(self, world: World, pose: Pose, light: Light, walls: int | None = None) -> Array:
         """The light that comes from each point of the scene, (DOWN rows, ACROSS columns, 3), without exposure and noise."""
+        an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
+        an_instance("light", light, Light, SimulatorError, mend="take Light.at(12)")
+        pose = pose_of("pose", pose)
         segments = world.segments
         bearings = math.pi - (np.arange(ACROSS * self.columns) + 0.5) * math.tau / (ACROSS * self.columns)
         far = meetings(segments, np.array([pose]), bearings)[0]

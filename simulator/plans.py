@@ -26,7 +26,8 @@ from scipy.optimize import linear_sum_assignment
 
 from simulator.errors import SimulatorError
 from simulator.motion import Pose, between, reported
-from ssh_abduction.errors import brief, is_whole, named, printable
+from ssh_abduction.checks import a_number, a_path, a_text, a_whole_number, all_instances, an_instance
+from ssh_abduction.errors import brief, named, printable
 from ssh_abduction.files import read_at_most
 from ssh_abduction.odometry import Odometry
 from ssh_abduction.star import Gateway as Sighted
@@ -44,6 +45,8 @@ STRAIGHT = 20.0
 APART = 3.0
 # A view tells the directions of doors to so many degrees.
 COARSE = 45
+# A tour has so many actions at most: a trace of them fits into memory.
+MOST_STEPS = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -88,9 +91,15 @@ class Plan:
     rooms: tuple[Room, ...]
     doors: tuple[Door, ...]
 
+    def __post_init__(self) -> None:
+        a_text("plan.name", self.name, SimulatorError)
+        object.__setattr__(self, "rooms", all_instances("plan.rooms", self.rooms, Room, SimulatorError, mend="give rooms"))
+        object.__setattr__(self, "doors", all_instances("plan.doors", self.doors, Door, SimulatorError, mend="give doors"))
+
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
         """The plan in an XML file. Raises SimulatorError that says where."""
+        path = a_path("path", path, SimulatorError)
         try:
             data = read_at_most(path, LARGEST)
         except OSError as error:
@@ -172,6 +181,8 @@ class Plan:
     def told_apart(self, degrees: float = APART) -> Plan:
         """This plan with fewer doors, so that those of a room are at least so many degrees apart. Of several the nearest to the middles of its rooms is kept."""
 
+        a_number("degrees", degrees, SimulatorError, 0, 180, what="degrees")
+
         def far(number: int) -> float:
             door = self.doors[number]
             return sum(math.dist(door.position, self.rooms[room].centre) for room in door.rooms)
@@ -218,8 +229,13 @@ def tour(
     apart        degrees by which the doors of a room are told apart, as in Plan.told_apart. A bearing is off by a quarter of that at most, so that no two doors look like one
     The truth has dstate, place, path and pose. Raises SimulatorError where no two rooms are connected.
     """
-    if not is_whole(steps) or steps < 0:
-        raise SimulatorError(f"steps: expected a number of actions, 0 or more, got {brief(steps)}")
+    an_instance("plan", plan, Plan, SimulatorError, mend="take Plan.load")
+    a_whole_number("steps", steps, SimulatorError, 0, MOST_STEPS, what="a number of actions")
+    a_whole_number("seed", seed, SimulatorError)
+    if odometry is not None:
+        an_instance("odometry", odometry, Odometry, SimulatorError, mend="make one with Odometry(), or leave it out")
+    a_number("scale", scale, SimulatorError, -1, 1, what="a share")
+    a_number("bend", bend, SimulatorError, -1, 1, what="radians a metre")
     plan = plan.told_apart(apart)
     if len(plan.connected) < 2:
         raise SimulatorError(f"{plan.name}: expected rooms with doors between them, got none that are connected; take another plan")

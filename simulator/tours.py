@@ -23,12 +23,15 @@ from simulator.panorama import Camera
 from simulator.robot import Body, Report, Robot
 from simulator.watch import Watch
 from simulator.world import World
+from ssh_abduction.checks import a_flag, a_number, a_whole_number, an_instance
 from ssh_abduction.odometry import Covariance, Displacement
 from ssh_abduction.odometry import Odometry as Noise
 from ssh_abduction.trace import Action, Step, Trace
 from ssh_abduction.words import counted
 
 Array = NDArray[np.float64]
+# More tours than this are a mistake: to drive them takes days, and all steps are kept in memory.
+MOST_TOURS = 100_000
 QUARTERS = {"travel": 0, "right": 1, "around": 2, "left": 3}
 
 
@@ -82,8 +85,12 @@ def simulate(
     the trace's odometry is the noise that fits them. The truth goes into `truth`: dstate, place, path and pose. Nothing but evaluation may read it.
     Raises SimulatorError where the route cannot be driven.
     """
-    if every is not None and not (math.isfinite(every) and every > 0):
-        raise SimulatorError(f"every: expected a number of metres above 0, got {every}; leave it out for images at dstates")
+    if every is not None:
+        a_number("every", every, SimulatorError, above=0, what="a number of metres", mend="leave it out for images at dstates")
+    a_flag("stars", stars, SimulatorError)
+    if camera is not None:
+        an_instance("camera", camera, Camera, SimulatorError, mend="make one with Camera(), or leave it out for ranges")
+    an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
     if world.by_places:
         raise SimulatorError(
             f"{world.name}: route: expected actions, got places, to which a robot drives that logs scans all along; write --as carmen, or give a route of actions"
@@ -153,8 +160,12 @@ def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]
 
 def _driver(world: World, tours: int, seed: int, laser: Laser | None, body: Body | None, tolerance: Tolerance | None) -> Driver:
     """A robot at the start of a world. Raises SimulatorError where no tour can begin."""
-    if tours < 1:
-        raise SimulatorError(f"tours: expected 1 or more, got {tours}")
+    an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
+    a_whole_number("tours", tours, SimulatorError, 1, MOST_TOURS)
+    a_whole_number("seed", seed, SimulatorError)
+    for name, given, kind in (("laser", laser, Laser), ("body", body, Body), ("tolerance", tolerance, Tolerance)):
+        if given is not None:
+            an_instance(name, given, kind, SimulatorError, mend=f"make one with {kind.__name__}(), or leave it out")
     if not world.route:
         raise SimulatorError(f"{world.name}: route: expected at least one action, got none; add it to the world, or give one")
     body = body or Body()

@@ -15,13 +15,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.occupancy import FARTHEST, read_occupancy
+from ssh_abduction.checks import a_number, a_path, a_text, all_instances, an_instance, an_object, numbers, one_of
 from ssh_abduction.errors import brief, is_finite, named, printable
 from ssh_abduction.files import parse_json, read_at_most
 
@@ -40,6 +41,19 @@ SQUARE, OBLIQUE = math.radians(5), 0.1
 NEAREST = 0.01
 # Bytes that a world file may have.
 LARGEST = 64 * 2**20
+
+
+def checked_segments(name: str, value: object) -> Array:
+    """Segments, (n, 4), in metres. Raises SimulatorError."""
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.shape[1:] == (4,) and len(value) and np.isfinite(value).all():
+        return value
+    raise SimulatorError(f"{name}: expected an array of segments, (n, 4) in metres, got {brief(value)}; make one with numpy.array")
+
+
+def pose_of(name: str, value: object) -> tuple[float, float, float]:
+    """A pose (x, y, heading), in metres and radians. Raises SimulatorError."""
+    x, y, heading = numbers(name, value, SimulatorError, 3, "x, y and heading, in metres and radians")
+    return x, y, heading
 
 
 @dataclass(frozen=True)
@@ -89,6 +103,21 @@ class World:
     via: Mapping[str, Point] = field(default_factory=dict, repr=False)
     own_reach: float | None = None
 
+    def __post_init__(self) -> None:
+        a_text("world.name", self.name, SimulatorError)
+        checked_segments("world.segments", self.segments)
+        object.__setattr__(self, "start", pose_of("world.start", self.start))
+        a_number("world.reach", self.reach, SimulatorError, NEAREST, FARTHEST, what="metres")
+        if self.own_reach is not None:
+            a_number("world.own_reach", self.own_reach, SimulatorError, NEAREST, FARTHEST, what="metres")
+        one_of("world.angles", self.angles, get_args(Angles), SimulatorError)
+        for name, kind in (("clutter", Clutter), ("route", str), ("dstates", TrueDState)):
+            members = all_instances(f"world.{name}", getattr(self, name), kind, SimulatorError, mend="read a world with World.load")
+            object.__setattr__(self, name, members)
+        for name in ("places", "via"):
+            for place, point in an_object(f"world.{name}", getattr(self, name), SimulatorError).items():
+                numbers(f"world.{name}[{brief(place)}]", point, SimulatorError, 2, "x and y in metres")
+
     @property
     def by_places(self) -> bool:
         """Whether the route is one of places."""
@@ -107,11 +136,14 @@ class World:
 
     def holds(self, x: float, y: float) -> bool:
         """Whether a point is within the bounds of the walls."""
+        a_number("x", x, SimulatorError, -FARTHEST, FARTHEST, what="metres")
+        a_number("y", y, SimulatorError, -FARTHEST, FARTHEST, what="metres")
         left, bottom, right, top = self.bounds
         return left < x < right and bottom < y < top
 
     def arranged(self, rng: np.random.Generator) -> World:
         """This world as it is on one tour: the clutter has been moved at random, and is part of the walls."""
+        an_instance("rng", rng, np.random.Generator, SimulatorError, mend="take numpy.random.default_rng(0)")
         parts = [self.segments]
         for item in self.clutter:
             shift = rng.uniform(-1, 1, 2) * np.array(item.moves)
@@ -121,6 +153,8 @@ class World:
 
     def clearance(self, x: float, y: float) -> float:
         """Metres from a point to the nearest wall."""
+        a_number("x", x, SimulatorError, -FARTHEST, FARTHEST, what="metres")
+        a_number("y", y, SimulatorError, -FARTHEST, FARTHEST, what="metres")
         a, b = self.segments[:, :2], self.segments[:, 2:]
         along = b - a
         length = np.maximum((along**2).sum(1), 1e-12)
@@ -129,9 +163,9 @@ class World:
 
     def nearest(self, pose: Sequence[float]) -> TrueDState | None:
         """The true dstate that is nearest to a pose, where a radian counts like a metre; None if the world knows no true dstates."""
+        x, y, heading = pose_of("pose", pose)
         if not self.dstates:
             return None
-        x, y, heading = pose
 
         def far(s: TrueDState) -> float:
             return math.hypot(s.pose[0] - x, s.pose[1] - y) + abs(math.remainder(s.pose[2] - heading, math.tau))
@@ -144,8 +178,8 @@ class World:
         world = self
         if start is not None:
             try:
-                pose = [float(x) for x in start.split(",")]
-            except (ValueError, AttributeError):
+                pose = [float(x) for x in a_text("start", start, SimulatorError).split(",")]
+            except ValueError:
                 raise reader.wrong("start", "x,y,degrees", start) from None
             world = replace(world, start=reader.pose(pose, "start"))
         if route is not None:
@@ -158,7 +192,7 @@ class World:
     def named(cls, name: str) -> World:
         """A world that comes with the package (as notched-rectangle or triangle), or the one in a file: .json, or .yaml for an occupancy map."""
         shipped = {path.stem: path for path in (Path(str(files("simulator"))) / "worlds").glob("*.json")}
-        if name in shipped:
+        if isinstance(name, str) and name in shipped:
             return cls.load(shipped[name])
         if not isinstance(name, str) or not Path(name).suffix:
             raise SimulatorError(
@@ -169,6 +203,7 @@ class World:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> World:
         """The world in a JSON file. Raises SimulatorError that names the field."""
+        path = a_path("path", path, SimulatorError)
         try:
             data = parse_json(read_at_most(path, LARGEST).decode("utf-8"))
         except OSError as error:
@@ -180,7 +215,7 @@ class World:
     @classmethod
     def from_occupancy(cls, path: str | os.PathLike[str]) -> World:
         """The world whose walls are those of an occupancy map, as ROS stores it: a YAML file and its image (docs/worlds.md)."""
-        name, segments = read_occupancy(Path(path))
+        name, segments = read_occupancy(Path(a_path("path", path, SimulatorError)))
         middle = segments.reshape(-1, 2).mean(0)
         return cls(printable(name), segments, start=(float(middle[0]), float(middle[1]), 0.0))
 

@@ -30,6 +30,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, TypeAlias
 
 from ssh_abduction.asp.limits import check_limit
+from ssh_abduction.checks import a_function
 from ssh_abduction.errors import TheoryError, TraceError, brief, is_whole
 from ssh_abduction.evaluation import evaluate
 from ssh_abduction.maps import SSHMap
@@ -39,7 +40,7 @@ from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.rivals.tour import next_tour
 from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.solver.search import solve
-from ssh_abduction.theory.theory import Theory
+from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Action, Step, Trace
 from ssh_abduction.words import counted
 
@@ -137,7 +138,9 @@ class Explorer:
         if not is_whole(margin) or margin < 0:
             raise TraceError(f"margin: expected a number of dstates, 0 or more, got {brief(margin)}")
         check_limit("limit", "seconds", limit)
-        if theory is not None and theory.has_faults:
+        for name in ("look", "can", "do"):
+            a_function(f"robot.{name}", getattr(robot, name, None), TraceError, what="a method of the robot")
+        if theory is not None and checked_theory(theory).has_faults:
             raise TheoryError(
                 "theory: expected one without faults, as what contradicts all maps ends an exploration, got misread or slipped; leave them out"
             )

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from ssh_abduction.asp.limits import LimitError, Watch
+from ssh_abduction.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.engines.base import Found, Task
 from ssh_abduction.errors import TheoryError, brief, is_whole
 from ssh_abduction.maps import SSHMap
@@ -77,7 +77,8 @@ def fault_front(trace: Trace, theory: Theory | None = None, most: int = 5, limit
 
     Raises TheoryError where the theory has places: their axioms are not known to the engine that counts faults.
     """
-    theory = checked_theory(theory or Theory.causal())
+    theory = Theory.causal() if theory is None else checked_theory(theory)
+    check_limit("limit", "seconds", limit)
     if theory.jumped:
         raise TheoryError("jumped: expected no wrong displacements where faults are counted; leave it out (--jumped)")
     if theory.level != "causal":

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from perception.confidence import NOISE
 from perception.recognition import recogniser
-from ssh_abduction.errors import SSHError
+from ssh_abduction.errors import SSHError, brief, is_whole
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.trace import Trace
@@ -34,8 +34,8 @@ def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool 
     """
     if not maps:
         raise LearnerError("maps: expected at least one to take labels from, got none; see the solution's status")
-    if choose is not None and not 0 <= choose < len(maps):
-        raise LearnerError(f"map: expected an index from 0 to {len(maps) - 1}, got {choose}")
+    if choose is not None and (not is_whole(choose) or not 0 <= choose < len(maps)):
+        raise LearnerError(f"map: expected an index from 0 to {len(maps) - 1}, got {brief(choose)}")
     labels = np.array(maps[choose or 0].labels, np.intp)
     if choose is not None:
         return labels

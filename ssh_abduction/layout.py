@@ -23,6 +23,7 @@ from scipy.optimize import linprog
 from scipy.sparse import coo_array
 from scipy.spatial.distance import pdist
 
+from ssh_abduction.checks import an_object
 from ssh_abduction.errors import MapError, brief, is_finite
 from ssh_abduction.trace import Trace
 
@@ -110,10 +111,10 @@ def degrees_of(turns: Trace | Turns | None) -> dict[str, tuple[float, float]]:
         actions = {action.name: action for action in turns.actions if action.turn is not None}
         known |= {name: action.turn or "" if action.bearing is None else float(action.bearing) for name, action in actions.items()}
     elif turns is not None:
-        known |= dict(turns)
+        known |= an_object("turns", turns, MapError)
     degrees = {}
     for name, turn in known.items():
-        if turn in SIDES:
+        if isinstance(turn, str) and turn in SIDES:
             degrees[name] = (SIDES[str(turn)], GUESSED)
         elif is_finite(turn):
             degrees[name] = (float(turn), SURE)

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, clone
+from sklearn.base import BaseEstimator
 
 from perception.confidence import warn_of_doubts
-from perception.recognition import recogniser
+from perception.recognition import cloned, recogniser
 from perception.views import ISOLATED, ViewClusterer, as_view_clusterer
 from ssh_abduction.labels import AmbiguousMapWarning, LearnerError, labels_of, labels_of_all, labels_on, map_of
 from ssh_abduction.logs import log_of
@@ -95,9 +95,9 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     def _look(self, traces: Traces, isolated: float | None) -> Traces:
         """The traces with their views, and, where there is one, with those of the runner-up."""
         usual = ViewClusterer(random_state=0, isolated=isolated)
-        self.features_ = (traces.features if self.features is None else clone(self.features)).fit(traces.images)
+        self.features_ = (traces.features if self.features is None else cloned("features", self.features, "transform")).fit(traces.images)
         images = self.features_.transform(traces.images)
-        self.clusterer_ = as_view_clusterer(usual if self.clusterer is None else clone(self.clusterer)).fit(images)
+        self.clusterer_ = as_view_clusterer(usual if self.clusterer is None else cloned("clusterer", self.clusterer)).fit(images)
         self.views_, self.confidence_ = self.clusterer_.labels_, self.clusterer_.confidence_
         log_of(__name__).info("%d images, %d views", len(traces.images), self.clusterer_.k_)
         warn_of_doubts(self.views_, self.confidence_, self.clusterer_.quality_[self.clusterer_.k_])

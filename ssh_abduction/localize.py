@@ -48,6 +48,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
+from ssh_abduction.checks import a_number
 from ssh_abduction.errors import LocaliserError, MapError, TraceError, brief, is_finite, named
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.trace import Action, Step, Trace, View, checked_trace
@@ -200,10 +201,12 @@ class Belief:
 
         sure  the entropy, in bits, of the belief before it was lost
         """
+        a_number("sure", sure, LocaliserError, 0, what="bits of entropy")
         return self.nowhere <= 0.5 and (self.probability >= LOCATED or self.entropy <= sure + AS_SURE)
 
     def above(self, least: float) -> tuple[tuple[int, float], ...]:
         """The dstates of at least this probability, and their probabilities, the most probable one first."""
+        a_number("least", least, LocaliserError, 0, 1, what="a probability")
         found = np.flatnonzero(self.probabilities >= least)
         found = found[np.argsort(-self.probabilities[found], kind="stable")]
         return tuple((int(s), float(self.probabilities[s])) for s in found)

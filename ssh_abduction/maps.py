@@ -20,6 +20,7 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
 from ssh_abduction import cards
+from ssh_abduction.checks import a_path, a_text, all_instances, an_instance
 from ssh_abduction.errors import MapError, brief, is_finite, is_whole, is_writable, named, printable, xml_text
 from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
 from ssh_abduction.trace import Trace, View
@@ -319,14 +320,18 @@ class SSHMap:
 
         turns  which way actions turn: the trace that was mapped, or for each name "right", "left", "around" or degrees clockwise. Actions of these names need none
         """
+        from ssh_abduction.layout import degrees_of
         from ssh_abduction.picture import svg
 
+        degrees_of(turns)
         return svg(self, turns)
 
     def plot(self, ax: Any = None, turns: Trace | Turns | None = None) -> Any:
         """Draw the map with matplotlib, into these axes or into new ones, and return the axes. Raises MapError where matplotlib is not installed."""
+        from ssh_abduction.layout import degrees_of
         from ssh_abduction.plotting import plot
 
+        degrees_of(turns)
         return plot(self, ax, turns)
 
     def to_pandas(self) -> pd.DataFrame:
@@ -370,6 +375,12 @@ class SSHMap:
         """
         import networkx as nx
 
+        if turns is not None:
+            from ssh_abduction.layout import degrees_of  # loads scipy
+
+            degrees_of(turns)
+        if not isinstance(level, str):
+            raise MapError(f'level: expected "causal", "topological" or "places", got {brief(level)}')
         if level == "causal":
             causal: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
             for s in self.dstates:
@@ -440,6 +451,16 @@ class SSHMap:
         return "\n".join([*lines, "}"])
 
 
+def checked_map(value: object, name: str = "map") -> SSHMap:
+    """The map that a caller gives. Raises MapError."""
+    return an_instance(name, value, SSHMap, MapError, mend="take one of solution.maps, or SSHMap.load")
+
+
+def checked_maps(values: object) -> tuple[SSHMap, ...]:
+    """The maps that a caller gives. Raises MapError."""
+    return all_instances("maps", values, SSHMap, MapError, mend="take the maps of a solution, or SSHMap.load")
+
+
 def _where(dstate: DState) -> tuple[object, object]:
     """The place and the course of a dstate, as a table shows them."""
     place = "" if dstate.place is None else dstate.place
@@ -452,6 +473,7 @@ def write_map(path: str | os.PathLike[str], text: str, what: str = "map", option
     what    is written, as messages call it
     option  by which the file was named
     """
+    path = a_path("path" if option == "output" else option, path, MapError)
     try:
         write_file(path, f"{text}\n".encode())
     except OSError as error:
@@ -467,9 +489,10 @@ def _numbered(ids: Iterable[int | None]) -> dict[int | None, int]:
 
 def read_json(path: str | os.PathLike[str]) -> Any:
     """The JSON value in a file. Raises MapError that names the file and the line."""
-    source = "standard input" if str(path) == "-" else named(path)
+    path = a_path("path", path, MapError)
+    source = "standard input" if path == "-" else named(path)
     try:
-        text = sys.stdin.buffer.read(LARGEST + 1) if str(path) == "-" else _read_at_most(path, LARGEST)
+        text = sys.stdin.buffer.read(LARGEST + 1) if path == "-" else _read_at_most(path, LARGEST)
         if len(text) > LARGEST:
             raise MapError(f"{source}: expected at most {LARGEST // 2**20} MiB, got more; list fewer (solve --maps)")
         if not text.strip():
@@ -554,7 +577,7 @@ class FieldReader:
     """Checks the fields of what was read, and says which one is wrong."""
 
     def __init__(self, where: str) -> None:
-        self.where = where
+        self.where = a_text("where", where, MapError)
 
     def wrong(self, name: str, expected: str, value: Any) -> MapError:
         return MapError(f"{self.where}: {name or 'map'}: expected {expected}, got {brief(value)}; write it with solve --json")

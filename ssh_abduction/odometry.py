@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, TypeAlias
 
+from ssh_abduction.checks import an_object
 from ssh_abduction.errors import TraceError, brief, is_finite
 
 Pose: TypeAlias = tuple[float, float, float]
@@ -64,6 +65,7 @@ class Odometry:
                     f"odometry.{name}: expected a number from 0 to {FARTHEST:.0f}, got {brief(value)}; give a standard deviation"
                 )
             object.__setattr__(self, name, float(value))
+        an_object("odometry.extra", self.extra, TraceError)
 
     @classmethod
     def of(cls, value: Any) -> Odometry:
@@ -80,7 +82,7 @@ class Odometry:
 
     def covariance(self, displacement: Displacement) -> Covariance:
         """The covariance of a displacement, (3, 3), in metres and radians and in the frame of the robot before it moved."""
-        dx, dy, turned = displacement
+        dx, dy, turned = checked_displacement(displacement, "displacement")
         along, across, offset = (self.along * dx) ** 2, (self.across * dx) ** 2, self.position**2 + ROUNDED**2
         along, across = along + (self.along * dy) ** 2, across + (self.across * dy) ** 2
         way = math.hypot(dx, dy)

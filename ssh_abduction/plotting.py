@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.drawing import ALARM, COLOURS
-from ssh_abduction.errors import MapError
+from ssh_abduction.errors import MapError, brief
 from ssh_abduction.layout import Turns, layout, travelled
 from ssh_abduction.trace import Trace
 
@@ -26,6 +26,8 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
 
     Returns the axes. Raises MapError where matplotlib is not installed.
     """
+    if ax is not None and not hasattr(ax, "annotate"):
+        raise MapError(f"ax: expected axes of matplotlib, got {brief(ax)}; make some with matplotlib.pyplot.subplots, or leave them out")
     found = layout(ssh_map, turns)
     spots = list(found.places.values()) or [(x, y) for x, y, _ in found.dstates]
     unit = _nearest(spots)

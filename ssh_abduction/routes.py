@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 import networkx as nx
 
+from ssh_abduction.checks import a_list
 from ssh_abduction.errors import MapError, brief, is_whole, printable
 from ssh_abduction.layout import located
 from ssh_abduction.maps import SSHMap
@@ -183,7 +184,7 @@ def route(
 
     Raises MapError where there is no such dstate, place or map, where no route exists, and where metres are asked of a map without poses.
     """
-    if by not in BY:
+    if not isinstance(by, str) or by not in BY:
         raise MapError(f"by: expected {', '.join(BY[:-1])} or {BY[-1]}, got {brief(by)}; say what the route shall have the fewest of")
     listing = Listing.of(maps)
     number = listing.number(str(map))
@@ -214,7 +215,7 @@ class _Roads:
             wanted = {self._place(node) for node in there}
             there = {node for node in self.graph if self._place(node) in wanted}
         closed: set[Node] = set()
-        for i, name in enumerate([avoid] if isinstance(avoid, str | int) else avoid):
+        for i, name in enumerate([avoid] if isinstance(avoid, str | int) else a_list("avoid", avoid, MapError, what="dstates and places")):
             closed |= self._nodes(name, f"avoid[{i}]")[0]
         for nodes, name in ((here, "from"), (there, "to")):
             if nodes <= closed:

@@ -16,6 +16,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from ssh_abduction.asp.limits import check_limit
+from ssh_abduction.checks import a_flag, a_whole_number, an_instance
+from ssh_abduction.errors import MapError, SolverError, TheoryError
 from ssh_abduction.evaluation import Evaluation, evaluate, tells_names
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
@@ -127,10 +130,23 @@ def ladder(
     known   a solution of this trace that is there already: the rung that has its theory takes it, and is not solved again
     under_way  what can interrupt the ladder from elsewhere; Ctrl-C does so without
     """
-    under_way = under_way or UnderWay()
     checked_trace(trace)
+    theory = checked_theory(theory)
+    check_limit("limit", "seconds", limit)
+    a_whole_number("maps", maps, SolverError, what="a whole number of maps, where 0 lists all")
+    a_flag("stars", stars, TheoryError)
+    if known is not None:
+        an_instance("known", known, Solution, MapError, mend="give what solve returned for this trace, or leave it out")
+    if under_way is not None:
+        an_instance("under_way", under_way, UnderWay, SolverError)
+    return _solved(trace, theory, limit, maps, stars, known, under_way or UnderWay())
+
+
+def _solved(
+    trace: Trace, theory: Theory, limit: float | None, maps: int, stars: bool, known: Solution | None, under_way: UnderWay
+) -> Iterator[Rung]:
     has_truth = tells_names(trace)
-    for name, chosen in rungs(trace, checked_theory(theory), stars):
+    for name, chosen in rungs(trace, theory, stars):
         solution = known if known and known.theory == chosen.resolve(trace) else under_way.solve(trace, chosen, limit=limit, maps=maps)
         is_judged = has_truth and solution.maps and not under_way.interrupted
         yield Rung(name, solution, evaluate(solution.maps, trace) if is_judged else None)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias, overload
 
 from ssh_abduction import cards
+from ssh_abduction.checks import a_list, a_path, a_text, a_whole_number, an_instance, an_object
 from ssh_abduction.errors import RangeError, TraceError, brief, checked_index, is_finite, is_whole, is_writable, named
 from ssh_abduction.files import LINE_OF_A_LOG, HalfCharacter, NotFinite, json_line, parse_json, write_file
 from ssh_abduction.odometry import Covariance, Displacement, Odometry, checked_covariance, checked_displacement
@@ -72,12 +73,13 @@ class Action:
         name, kind, turn = self.name, self.kind, self.turn
         if not isinstance(name, str) or not name or "\0" in name or not is_writable(name):
             raise TraceError(f"action.name: expected a text, got {brief(name)}; name the action")
-        if kind not in (None, *_KINDS):
+        if not isinstance(kind, str | None) or kind not in (None, *_KINDS):
             raise TraceError(f'action.kind: expected "travel" or "turn", got {brief(kind)}; leave it out for other actions')
-        if turn not in (None, *_TURNS):
+        if not isinstance(turn, str | None) or turn not in (None, *_TURNS):
             raise TraceError(f'action.turn: expected "right", "left" or "around", got {brief(turn)}; choose the nearest')
         if turn is not None and kind != "turn":
             raise TraceError(f'action.kind: expected "turn", as the action has a turn, got {brief(kind)}; set the kind or drop the turn')
+        an_object("action.extra", self.extra, TraceError)
         if self.bearing is not None:
             turn = self._turn_of_bearing()
             object.__setattr__(self, "turn", turn)
@@ -105,7 +107,7 @@ class Action:
     @staticmethod
     def that_slipped(step: int) -> Action:
         """What stands for the action of a step that did not do what its name says: nothing is known of it, and it is like no other action."""
-        return Action(f"slipped at step {step}", extra={"slipped": True})
+        return Action(f"slipped at step {a_whole_number('step', step, TraceError)}", extra={"slipped": True})
 
     @property
     def slipped(self) -> bool:
@@ -166,11 +168,16 @@ class Step:
 
     def __post_init__(self) -> None:
         if self.view is not None:
-            _view(self.view, "view")
+            object.__setattr__(self, "view", _view(self.view, "view"))
+        if self.action is not None:
+            an_instance("action", self.action, Action, TraceError, mend='make one with Action.of("travel")')
+        an_object("extra", self.extra, TraceError)
+        if self.image is not None:
+            object.__setattr__(self, "image", _frozen_image(self.image))
         if self.confidence is not None:
             object.__setattr__(self, "confidence", _probability(self.confidence, "confidence"))
         if self.star is not None:
-            parse_star(self.star, "star")
+            object.__setattr__(self, "star", parse_star(self.star, "star"))
         if self.displacement is not None:
             object.__setattr__(self, "displacement", checked_displacement(self.displacement, "displacement"))
         if self.covariance is not None:
@@ -196,6 +203,7 @@ class Step:
         covariance: Sequence[Sequence[float]] | None = None,
     ) -> Step:
         """A step from a view, and perhaps a star and a displacement. Raises TraceError that says where."""
+        a_text("where", where, TraceError)
         seen, openings = _view(view, f"{where}: view"), None if star is None else parse_star(star, f"{where}: star")
         try:
             return Step(seen, action, openings, displacement, covariance)  # type: ignore[arg-type]
@@ -256,6 +264,12 @@ class Trace:
             raise TraceError(f"steps: expected a tuple of Step, got {brief(self.steps)}; take Trace.from_steps for views and actions")
         if not self.steps:
             raise TraceError(f"{named(self.source or 'trace')}: expected at least one step, got none; add what the robot saw first")
+        for name in ("name", "images", "source"):
+            if getattr(self, name) is not None:
+                a_text(name, getattr(self, name), TraceError, mend="give a text, or leave it out")
+        if self.odometry is not None:
+            an_instance("odometry", self.odometry, Odometry, TraceError, mend="make one with Odometry.of, or leave it out")
+        an_object("extra", self.extra, TraceError)
         last = len(self.steps) - 1
         types: dict[str, tuple[int, Action]] = {}
         for i, step in enumerate(self.steps):
@@ -362,13 +376,14 @@ class Trace:
 
     def covariance(self, step: int) -> Covariance | None:
         """The covariance of a step's displacement: the one that it came with, or else by the odometry. None where the step has no displacement."""
-        here = self.steps[step]
+        here = self.steps[a_whole_number("step", step, RangeError, 0, len(self) - 1)]
         if here.displacement is None or here.covariance is not None:
             return here.covariance
         return (self.odometry or Odometry()).covariance(here.displacement)
 
     def at(self, step: int) -> str:
         """Where a step is, as an error message says it: file and line, or the number of the step."""
+        a_whole_number("step", step, TraceError)
         return f"{named(self.source)}:{step + 2}" if self.source else f"step {step}"
 
     @classmethod
@@ -390,6 +405,8 @@ class Trace:
         covariances    of the displacements, (3, 3) each; None where the odometry tells it
         odometry       how far displacements without a covariance may be off
         """
+        if isinstance(actions, str):
+            raise TraceError(f"actions: expected a list, got {brief(actions)}; give the name of one action after another, as in ['travel']")
         seen, done = _listed(views, "views"), [Action.of(a) for a in _listed(actions, "actions")]
         if len(seen) != len(done) + 1:
             raise TraceError(
@@ -420,9 +437,9 @@ class Trace:
 
     def without_displacements_at(self, steps: Collection[int]) -> Trace:
         """The same trace, as if the displacements that lead to these steps were not known."""
-        if not steps:
+        unknown = {a_whole_number(f"steps[{i}]", step, TraceError) for i, step in enumerate(a_list("steps", steps, TraceError))}
+        if not unknown:
             return self
-        unknown = set(steps)
         return replace(
             self,
             steps=tuple(replace(step, displacement=None, covariance=None) if t in unknown else step for t, step in enumerate(self.steps)),
@@ -446,7 +463,7 @@ class Trace:
 
     def prefix(self, steps: int) -> Trace:
         """The first `steps` steps of this trace."""
-        head = self.steps[:steps]
+        head = self.steps[: a_whole_number("steps", steps, TraceError, 1)]
         if head:
             head = (*head[:-1], replace(head[-1], action=None))
         return replace(self, steps=head)
@@ -454,14 +471,15 @@ class Trace:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Trace:
         """The trace in a JSON Lines file, or on standard input for "-". Raises TraceError with file, line and field."""
-        source = "standard input" if str(path) == "-" else named(path)
+        path = a_path("path", path, TraceError)
+        source = "standard input" if path == "-" else named(path)
         try:
-            if str(path) == "-":
+            if path == "-":
                 if sys.stdin is None:
                     raise TraceError("standard input: expected a trace, got a closed stream; name a file")
                 return _parse(sys.stdin.buffer, source, source)
             with Path(path).open("rb") as file:
-                return _parse(file, source, str(path))
+                return _parse(file, source, path)
         except TraceError:
             raise
         except OSError as error:
@@ -471,6 +489,7 @@ class Trace:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trace as JSON Lines. A file appears whole or not at all; a device or a pipe is written into. Raises TraceError."""
+        path = a_path("path", path, TraceError)
         lines = "".join(line + "\n" for line in self.to_lines())
         try:
             write_file(path, lines.encode("utf-8"))
@@ -648,7 +667,7 @@ def _of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[A
 
 
 def _listed(values: Any, name: str) -> list[Any]:
-    if not isinstance(values, Iterable):
+    if not isinstance(values, Iterable) or isinstance(values, bytes | Mapping):
         raise TraceError(f"{name}: expected a list, got {brief(values)}; give one value a step")
     return list(values)
 
@@ -706,6 +725,13 @@ def _image(value: Any, where: str) -> tuple[float, ...] | int:
             raise TraceError(f"{where}: expected an index of 0 or more into the sidecar file, got {value}; count from 0")
         return value
     return tuple(_numbers(value, where))
+
+
+def _frozen_image(value: Any) -> tuple[float, ...] | int:
+    """An image as a step holds it. Of a tuple, as readers make them, the first number alone is looked at: traces are copied often, and panoramas are long."""
+    if isinstance(value, tuple) and (not value or is_finite(value[0])):
+        return value
+    return _image(value.tolist() if hasattr(value, "tolist") else value, "image")
 
 
 def _star_to_json(star: Sequence[Entry]) -> list[Any]:

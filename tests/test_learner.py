@@ -465,7 +465,7 @@ def test_errors_of_the_wings_are_one_line(tmp_path: Path, capsys: pytest.Capture
             ["simulate", "atlantis", "-o", str(tmp_path / "x")],
             "world: expected one of cluttered, curved, doors, five-ways, notched-rectangle, six-ways, taylor-hall",
         ),
-        (["simulate", "notched-rectangle", "--tours", "0", "-o", str(tmp_path / "x")], "tours: expected 1 or more"),
+        (["simulate", "notched-rectangle", "--tours", "0", "-o", str(tmp_path / "x")], "tours: expected a whole number from 1 to 100,000"),
         (["simulate", "notched-rectangle", "--route", "travel,travel", "-o", str(tmp_path / "x")], "expected a free way ahead, got a wall"),
         (["cluster", str(trace), "-o", str(tmp_path / "x")], "image: expected one, got none"),
         (["cluster", str(one), "-o", str(tmp_path / "x")], "minimum of 2 is required"),

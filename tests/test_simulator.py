@@ -494,7 +494,7 @@ def test_a_gap_through_which_the_robot_escapes(tmp_path: Path) -> None:
 def test_no_route_and_no_tours(tmp_path: Path) -> None:
     with pytest.raises(SimulatorError, match="route: expected at least one action"):
         simulate(world_of(tmp_path, route=[]))
-    with pytest.raises(SimulatorError, match="tours: expected 1 or more"):
+    with pytest.raises(SimulatorError, match="tours: expected a whole number from 1 to 100,000"):
         simulate(RECTANGLE, tours=0)
     for every in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(SimulatorError, match="every: expected a number of metres above 0"):

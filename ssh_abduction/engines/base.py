@@ -9,11 +9,11 @@ from typing import Protocol
 from ssh_abduction.asp.control import Asker, has_processors
 from ssh_abduction.asp.limits import Watch
 from ssh_abduction.engines.doubts import Settled
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.maps import SSHMap, checked_map
 from ssh_abduction.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.speedups import Speedups
-from ssh_abduction.theory.theory import Theory
+from ssh_abduction.theory.theory import Theory, checked_theory
 from ssh_abduction.trace import Trace
 
 # An engine with a chart tries a prefix of so many steps before one of AT_ONCE steps: most traces are settled by then.
@@ -34,6 +34,7 @@ class Cost:
 
     @staticmethod
     def of(ssh_map: SSHMap) -> Cost:
+        checked_map(ssh_map)
         faults = sum(round(10 * fault.cost) for fault in ssh_map.faults) / 10
         return Cost(len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.excused), faults)
 
@@ -44,7 +45,7 @@ class Cost:
 
     def preferred_by(self, theory: Theory) -> tuple[int, ...]:
         """The counts that a theory prefers, first to last."""
-        return tuple(getattr(self, name) for name in theory.priorities)
+        return tuple(getattr(self, name) for name in checked_theory(theory).priorities)
 
     def to_dict(self) -> dict[str, float]:
         counts: dict[str, float] = {"dstates": self.dstates, "places": self.places, "paths": self.paths}

@@ -32,7 +32,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ssh_abduction.errors import MapError, TraceError, brief, named
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.maps import SSHMap, checked_maps
 from ssh_abduction.trace import Trace, View, checked_trace
 from ssh_abduction.words import counted
 
@@ -119,6 +119,7 @@ def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
 
     Raises TraceError where no step has truth, or where it contradicts itself; MapError for a map of other steps.
     """
+    maps = checked_maps(maps)
     truth = _Truth(checked_trace(trace))
     return Evaluation(
         maps=tuple(_evaluated(checked_map(ssh_map, f"maps[{i}]", trace), truth) for i, ssh_map in enumerate(maps)),

@@ -30,10 +30,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.motion import Pose, between, moved
+from ssh_abduction.checks import an_instance
 from ssh_abduction.errors import TraceError, brief, is_finite, named
 from ssh_abduction.evaluation.names import checked_map
 from ssh_abduction.evaluation.relations import Relations
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.maps import SSHMap, checked_maps
 from ssh_abduction.trace import Trace, checked_trace
 from ssh_abduction.words import counted
 
@@ -163,6 +164,9 @@ def evaluate_visits(
             raise TraceError(
                 f"{name}: expected a number above 0, got {brief(value)}; say what counts as one {'place' if name == 'near' else 'dstate'}"
             )
+    maps = checked_maps(maps)
+    if relations is not None:
+        an_instance("relations", relations, Relations, TraceError, mend="make them with Relations.load, or leave them out")
     truth: _Poses | _Related = _Poses(trace) if relations is None else _Related(trace, relations)
     visit = np.cumsum([0, *(action.kind != "turn" for action in trace.actions)])
     places, dstates = _verdicts(truth, visit, near, turned)

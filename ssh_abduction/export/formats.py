@@ -18,8 +18,8 @@ from ssh_abduction.export.nav2 import nav2
 from ssh_abduction.export.roads import Roads
 from ssh_abduction.export.tmap2 import tmap2
 from ssh_abduction.files import json_line
-from ssh_abduction.layout import Turns
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.layout import Turns, degrees_of
+from ssh_abduction.maps import SSHMap, checked_map
 from ssh_abduction.trace import Trace
 
 FORMATS = ("nav2", "tmap2", "graphml", "dot", "networkx-json")
@@ -47,10 +47,12 @@ def export_map(
 
     Positions are metres where the map has poses, seen from the first dstate; else they are of a layout, and the file says so. Raises MapError for what no such file can hold.
     """
-    if to not in FORMATS:
+    checked_map(ssh_map)
+    degrees_of(turns)
+    if not isinstance(to, str) or to not in FORMATS:
         raise MapError(f"to: expected {', '.join(FORMATS[:-1])} or {FORMATS[-1]}, got {brief(to)}; take one of these")
     level = _level(ssh_map, to, level)
-    if level not in LEVELS:
+    if not isinstance(level, str) or level not in LEVELS:
         raise MapError(f"level: expected places or dstates, got {brief(level)}; say what nodes are")
     for field, text in (("name", name), ("frame", frame)):
         if not isinstance(text, str) or not text or not is_writable(text):

@@ -18,9 +18,10 @@ from typing import Any, TypeAlias
 
 import networkx as nx
 
+from ssh_abduction.checks import a_list, a_text
 from ssh_abduction.engines.doubts import Sort
-from ssh_abduction.errors import MapError, printable
-from ssh_abduction.maps import Fault, SSHMap
+from ssh_abduction.errors import MapError, brief, printable
+from ssh_abduction.maps import Fault, SSHMap, checked_map
 from ssh_abduction.rivals.table import NONE, Table
 from ssh_abduction.solver.sharing import stretches
 
@@ -139,6 +140,11 @@ def difference(first: SSHMap, other: SSHMap, names: tuple[str, str] = ("the firs
 
     names  what the maps are called in words
     """
+    checked_map(first, "first")
+    checked_map(other, "other")
+    called = tuple(a_text(f"names[{i}]", name, MapError) for i, name in enumerate(a_list("names", names, MapError)))
+    if len(called) != 2:
+        raise MapError(f"names: expected two, one for each map, got {brief(names)}; name both")
     if len(first.labels) != len(other.labels):
         raise MapError(f"maps: expected two of one trace, got one of {len(first.labels)} steps and one of {len(other.labels)}")
     first, other = first.renumbered(), other.renumbered()
@@ -156,7 +162,7 @@ def difference(first: SSHMap, other: SSHMap, names: tuple[str, str] = ("the firs
     faults = [tuple(f for f in mine.faults if f not in theirs.faults) for mine, theirs in ((first, other), (other, first))]
     return Difference(
         ids=(first.id, other.id),
-        names=names,
+        names=(called[0], called[1]),
         sizes=(_size(first), _size(other)),
         changes=tuple(changes),
         links=(only[0], only[1]),

@@ -22,8 +22,9 @@ from typing import Any
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import LimitError, Stop, Watch, check_limit
 from ssh_abduction.asp.rules import check_rules
+from ssh_abduction.checks import a_whole_number
 from ssh_abduction.engines.base import Cost
-from ssh_abduction.errors import SSHError, TraceError, brief, is_whole
+from ssh_abduction.errors import SolverError, SSHError, TraceError, brief, is_whole
 from ssh_abduction.explain import Axioms, Explanation, Interrupted, Piece, explain
 from ssh_abduction.rivals.derivation import Derivation, derive
 from ssh_abduction.solver.result import Progress, Status
@@ -293,6 +294,7 @@ def explain_pair(
     Raises TraceError for a step that the trace does not have, or for one step twice; and as solve does.
     Source: Kuipers & Beeson 2002, section 4.2, for why x0 and x4 of the rectangle differ.
     """
+    a_whole_number("maps", maps, SolverError, what="a whole number of maps, where 0 lists all")
     return PairQuestion(trace, first, second, checked_theory(theory).replace(**choices), limit=limit, memory=memory, maps=maps).answer()
 
 

@@ -40,14 +40,15 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ssh_abduction.asp.limits import LimitError, Stop, Watch, check_limit
+from ssh_abduction.checks import a_flag, a_function, a_list, an_instance
 from ssh_abduction.errors import MapError, brief, printable
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.rivals.consequences import Consequence, Consequences, is_possible
 from ssh_abduction.rivals.machines import UNKNOWN, Machine, Row, Seen, Sights, Table, Walk, links_of, machine_of, with_ends
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.sharing import stretches
-from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Action, Trace
+from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.trace import Action, Trace, checked_trace
 
 # What a robot can do where it sees this.
 Can: TypeAlias = Callable[[Seen], Iterable[str]]
@@ -250,15 +251,26 @@ def next_experiment(
     """
     check_limit("limit", "seconds", limit)
     check_limit("memory", "MiB", memory)
+    a_flag("complete", complete, MapError)
+    a_flag("implied", implied, MapError)
+    if theory is not None:
+        checked_theory(theory)
+    if trace is not None:
+        checked_trace(trace)
+    if can is not None:
+        a_function("can", can, MapError, what="a function of what is seen")
+    if watch is not None:
+        an_instance("watch", watch, Watch, MapError, mend="leave it out, and give limit and memory")
+    extra = [Action.of(action) for action in a_list("actions", actions, MapError)]
     if isinstance(maps, Solution):
         theory, complete, maps = theory or maps.theory, maps.complete, maps.maps
-    rivals = [maps] if isinstance(maps, SSHMap) else list(maps)
+    rivals = [maps] if isinstance(maps, SSHMap) else a_list("maps", maps, MapError, what="a Solution or maps")
     _check(rivals, trace)
     if watch is None:
         watch = Watch(limit, memory)
     watch.use_reserve()
     watch.start()
-    laboratory = _Laboratory(rivals, trace, theory, [Action.of(action) for action in actions], can, implied, watch)
+    laboratory = _Laboratory(rivals, trace, theory, extra, can, implied, watch)
     plan = laboratory.plan()
     watch.stop()
     return Experiment(

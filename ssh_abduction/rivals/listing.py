@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
+from ssh_abduction.checks import a_flag, a_text, an_instance
 from ssh_abduction.errors import MapError, brief, is_whole, named
 from ssh_abduction.maps import ID_LENGTH, SSHMap, maps_of, read_json
 from ssh_abduction.solver.recorded import theory_in
@@ -77,6 +78,7 @@ class Listing:
     @classmethod
     def from_dict(cls, data: Any, where: str = "maps") -> Listing:
         """What `solve --json` printed (docs/formats.md). Raises MapError with the field that is wrong."""
+        a_text("where", where, MapError)
         maps = tuple(ssh_map.renumbered() for ssh_map in maps_of(data, where))
         told: Mapping[str, Any] = data if isinstance(data, Mapping) and "maps" in data else {}
         for i, (record, ssh_map) in enumerate(zip(told.get("maps", [data]), maps, strict=True)):
@@ -124,6 +126,7 @@ class Listing:
 
         one_view  whether dstates have one view each, so that maps tell what was seen at each step
         """
+        a_flag("one_view", one_view, MapError)
         if not self.maps:
             raise MapError(f"{self.source}: expected maps, got none; see the status that solve gave")
         first = None
@@ -141,6 +144,7 @@ class Listing:
 
     def check_same_trace(self, other: Listing) -> None:
         """Raises MapError where the maps of another listing are of another trace."""
+        an_instance("other", other, Listing, MapError, mend="make one with Listing.of or Listing.load")
         if other.steps != self.steps:
             mend = "compare maps of one trace"
             raise MapError(f"{other.source}: expected {self.steps} steps, as the maps of {self.source} have, got {other.steps}; {mend}")

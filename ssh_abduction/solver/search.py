@@ -45,17 +45,18 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import groupby
-from typing import Any
+from typing import Any, get_args
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import LimitError, StageTimeError, Stop, Watch, check_limit
 from ssh_abduction.asp.rules import check_rules
+from ssh_abduction.checks import a_flag, an_instance, one_of
 from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Found, Task, cost_as_counted
 from ssh_abduction.engines.stepwise import StepEngine
-from ssh_abduction.errors import SolverError, TheoryError, brief
+from ssh_abduction.errors import SolverError, TheoryError, brief, is_whole
 from ssh_abduction.logs import PROGRESS, log_of
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.maps import SSHMap, checked_map, checked_maps
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.backbone import Rivals
 from ssh_abduction.solver.candidates import FRAMING_SHARE, Candidates
@@ -145,11 +146,11 @@ class Search:
         minimal: SSHMap | None = None,
     ) -> None:
         checked_trace(trace)
-        if isinstance(maps, bool) or not hasattr(maps, "__index__"):
+        if not is_whole(maps):
             raise SolverError(f"maps (--maps): expected a whole number, 0 for all, got {brief(maps)}")
         if maps < 0:
             raise SolverError(f"maps (--maps): expected 0 (all) or more, got {maps}")
-        if isinstance(within, bool) or not hasattr(within, "__index__") or within < 0:
+        if not is_whole(within) or within < 0:
             raise SolverError(
                 f"within (--within): expected a whole number, 0 or more, got {brief(within)}; say how much more than the least a map may cost"
             )
@@ -157,6 +158,11 @@ class Search:
         check_limit("memory (--memory-limit)", "MiB", memory)
         if on_progress is not None and not callable(on_progress):
             raise SolverError(f"on_progress: expected a function of one Progress, got {brief(on_progress)}")
+        a_flag("reasons", reasons, SolverError)
+        if after is not None:
+            an_instance("after", after, Search, SolverError, mend="give the search of the steps before, or leave it out")
+        if minimal is not None:
+            checked_map(minimal, "minimal")
         self.theory = checked_theory(theory).resolve(trace)
         if within and self.theory.has_faults:
             raise TheoryError(
@@ -552,6 +558,7 @@ class Search:
         """How the search ended, with the maps that the caller kept. If these are all that were given, and no minimal map is missing, they are put in an order that is
         the same in each run (`solver/ranking.py`).
         """
+        maps = checked_maps(maps)
         if self._known.complete or self._rivals.listed:
             maps = self._in_order(maps)
         return self._solution(maps, self.grounding)
@@ -602,6 +609,7 @@ class Search:
 
         stopped  why it is to end
         """
+        one_of("stopped", stopped, get_args(Stop), SolverError)
         with suppress(Exception):  # what the other thread changes meanwhile: a bound is a bound, and a map a map, without that
             if self.status in (Status.UNKNOWN, Status.FEASIBLE):
                 self._candidates.sketch()

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, Literal, TypeAlias
 
+from ssh_abduction.checks import a_text, a_whole_number
 from ssh_abduction.engines.doubts import Sort
 from ssh_abduction.errors import MapError, brief, is_whole
 from ssh_abduction.maps import DState, SSHMap
@@ -122,6 +123,8 @@ class Backbone:
     @classmethod
     def from_dict(cls, data: Any, steps: int, where: str = "backbone") -> Backbone:
         """What `to_dict` wrote, for a trace of so many steps. Raises MapError with the field that is wrong."""
+        a_text("where", where, MapError)
+        a_whole_number("steps", steps, MapError, 1)
         if not isinstance(data, Mapping) or not isinstance(data.get("proven"), bool) or "dstates" not in data:
             raise MapError(f"{where}: expected an object with proven and dstates, got {brief(data)}; write it with solve --json")
         dstates = _read_shared(data["dstates"], None, steps, f"{where}: dstates")

@@ -17,7 +17,7 @@ from typing import Any
 
 from ssh_abduction.errors import SolverError
 from ssh_abduction.steps.noise import Noise, noise_in
-from ssh_abduction.trace import Trace
+from ssh_abduction.trace import Trace, checked_trace
 from ssh_abduction.words import counted
 
 RESTS_ON = frozenset({"functional_view", "deterministic"})  # the axioms that make apart steps different dstates
@@ -48,12 +48,14 @@ class Certificate:
 
     def words(self, trace: Trace) -> dict[tuple[int, int], tuple[str, ...]]:
         """For each pair of steps of the clique the common actions that lead from them to different views. Raises SolverError."""
+        checked_trace(trace)
         return {pair: _word(trace, *pair) for pair in combinations(self.clique, 2)}
 
     def to_dict(self, trace: Trace | None) -> dict[str, Any]:
         """Plain data. Pairs that show different views at once need no word and are left out. Words of more than WRITTEN actions in all are left out, too, and so are all words where the trace is not at hand."""
         if trace is None:
             return {"clique": list(self.clique), "refuted": list(self.refuted)}
+        checked_trace(trace)
         words: list[list[Any]] = []
         written = 0
         for i, j in combinations(self.clique, 2):

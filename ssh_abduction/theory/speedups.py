@@ -20,7 +20,7 @@ from typing import Final
 
 from ssh_abduction.errors import SolverError, brief
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.theory import EXCUSED, Theory
+from ssh_abduction.theory.theory import EXCUSED, Theory, checked_theory
 from ssh_abduction.words import shortly
 
 
@@ -63,6 +63,7 @@ class Speedups:
 
     def that_hold_for(self, theory: Theory) -> Speedups:
         """Those of these speed-ups that hold for a theory, whose star is settled, by the table."""
+        theory = checked_theory(theory)
         valid = {speedup.switch for speedup in TABLE if speedup.holds_for(theory)}
         return replace(self, **{name: False for name in SPEEDUPS if name not in valid})
 

@@ -15,11 +15,12 @@ from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
+from ssh_abduction.checks import a_text, a_whole_number, an_instance, one_of
 from ssh_abduction.errors import TheoryError, TraceError, brief, is_finite, is_whole
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.rules import Rules
-from ssh_abduction.trace import Step, Trace
+from ssh_abduction.trace import Step, Trace, checked_trace
 from ssh_abduction.words import shortly
 
 Count: TypeAlias = Literal["dstates", "paths", "places", "excuses", "auto", "tenths"]
@@ -80,6 +81,7 @@ SPOKEN_FOR = {
     "returns",
     *ASSERTIONS,
 }
+FAULTS = ("misread", "misseen", "slipped", "jumped")
 CAUSAL = "Theory.causal() (--theory causal)"  # in error messages
 
 
@@ -139,7 +141,7 @@ class Theory:
 
     def __post_init__(self) -> None:
         for name, values in CHOICES.items():
-            if getattr(self, name) not in values:
+            if not isinstance(getattr(self, name), str) or getattr(self, name) not in values:
                 raise TheoryError(f"{name}: expected one of {', '.join(values)}, got {brief(getattr(self, name))}")
         for field in fields(self):
             if isinstance(field.default, bool) and not isinstance(getattr(self, field.name), bool):
@@ -279,6 +281,9 @@ class Theory:
 
         kind  misread (the view), misseen (the star), slipped (the action done there), or jumped (the displacement that led there)
         """
+        if not isinstance(kind, str) or kind not in FAULTS:
+            one_of("kind", kind, FAULTS, TheoryError)
+        _checked_step(step)
         price = 10 * (getattr(self, kind) if kind in ("slipped", "jumped") else self.misread)
         if not price or kind in ("slipped", "jumped") or step.confidence is None:
             return round(price)
@@ -337,6 +342,7 @@ class Theory:
         Raises TraceError where a view, the kind of an action, or a star is missing, TheoryError where stars are asked for but
         the trace has none.
         """
+        checked_trace(trace)
         star = self.star
         if star == "auto":
             star = "frame" if trace.has_stars else "none"
@@ -368,7 +374,8 @@ class Theory:
 
     def require(self, step: Step, where: str) -> None:
         """Raises TraceError, which says where, if a step lacks what the axioms need. Star has to be settled."""
-        if step.view is None:
+        a_text("where", where, TraceError)
+        if _checked_step(step).view is None:
             raise TraceError(f"{where}: view: expected one, got only an image; cluster the images into views first (ssh-abduction cluster)")
         if self.level == "topological" and step.action is not None and step.action.kind is None and not step.action.slipped:
             raise TraceError(
@@ -395,6 +402,7 @@ class Theory:
 
     def check_steps(self, trace: Trace) -> None:
         """Raises TheoryError where a pair names a step that the trace does not have."""
+        checked_trace(trace)
         for name in ASSERTIONS:
             for pair in getattr(self, name):
                 if max(pair) >= len(trace):
@@ -402,6 +410,7 @@ class Theory:
 
     def of_steps(self, first: int, length: int) -> Theory:
         """The theory of so many steps from the first one on, numbered from 0: pairs with other steps are dropped."""
+        first, length = (a_whole_number(name, value, TheoryError) for name, value in (("first", first), ("length", length)))
         kept = {
             name: tuple((i - first, j - first) for i, j in getattr(self, name) if first <= min(i, j) and max(i, j) < first + length)
             for name in ASSERTIONS
@@ -419,6 +428,10 @@ class Theory:
             raise TheoryError(f"theory: expected an object, got {brief(data)}")
         preset = cls.causal() if data.get("level") == "causal" else cls()
         return preset.replace(**{str(k): tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+
+
+def _checked_step(value: object) -> Step:
+    return an_instance("step", value, Step, TraceError, mend="take one of trace.steps")
 
 
 class _Checked(tuple[Pair, ...]):

@@ -12,11 +12,12 @@ from functools import cache
 from pathlib import Path as FilePath
 from typing import Any
 
+from ssh_abduction.checks import a_function
 from ssh_abduction.errors import MapError
 from ssh_abduction.maps import SSHMap, write_map
 from ssh_abduction.rivals.listing import Maps
 from ssh_abduction.rivals.page.content import Run, content_of
-from ssh_abduction.trace import Trace
+from ssh_abduction.trace import Trace, checked_trace
 
 HERE = FilePath(__file__).parent
 ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
@@ -64,6 +65,11 @@ def view_page(
 
     Raises MapError for maps of several traces, or of another one than this, and for beliefs without a run, or the other way round.
     """
+    for given in (trace, run):
+        if given is not None:
+            checked_trace(given)
+    if beliefs is not None:
+        a_function("beliefs", beliefs, MapError, what="a function of a map")
     if (run is None) != (beliefs is None):
         raise MapError("beliefs: expected a run that they are of, and beliefs for a run, got one of the two; give both, or none")
     return Page(content_of(source, trace, None if run is None or beliefs is None else Run(run, beliefs)))

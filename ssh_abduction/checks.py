@@ -1,0 +1,158 @@
+"""One way to check the arguments of public functions: each check returns the value, or raises one of the package's errors.
+
+>>> from ssh_abduction.checks import a_number, one_of
+>>> from ssh_abduction.errors import MapError, SolverError
+>>> a_number("near", 2, SolverError, above=0, what="metres")
+2.0
+>>> a_number("near", -1, SolverError, above=0, what="metres")
+Traceback (most recent call last):
+ssh_abduction.errors.SolverError: near: expected metres above 0, got -1; change it
+>>> one_of("level", "rooms", ("places", "dstates"), MapError)
+Traceback (most recent call last):
+ssh_abduction.errors.MapError: level: expected places or dstates, got 'rooms'; take one of these
+
+All checks take the name of the argument, its value, and the error to raise. numpy's numbers are numbers; true and false are
+none. A path is a text or an os.PathLike that stands for a text. Bytes are no path: decode them with os.fsdecode.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeAlias, TypeVar
+
+from ssh_abduction.errors import SSHError, brief, is_finite, is_whole
+
+T = TypeVar("T")
+Kind: TypeAlias = type[SSHError]
+
+
+def a_number(
+    name: str,
+    value: object,
+    error: Kind,
+    low: float = -math.inf,
+    high: float = math.inf,
+    *,
+    above: float = -math.inf,
+    what: str = "a number",
+    mend: str = "change it",
+) -> float:
+    """A finite number from `low` to `high` that is greater than `above`.
+
+    Args:
+        name: What messages call the argument.
+        value: What the caller gave.
+        error: The error to raise.
+        low: The least number allowed.
+        high: The greatest number allowed.
+        above: A bound that is not allowed itself.
+        what: What messages call such numbers, with their unit.
+        mend: What the caller should do.
+    """
+    if is_finite(value) and low <= value <= high and value > above:
+        return float(value)
+    raise error(f"{name}: expected {what}{_between(low, high, above)}, got {brief(value)}; {mend}")
+
+
+def a_whole_number(
+    name: str,
+    value: object,
+    error: Kind,
+    low: int = 0,
+    high: float = math.inf,
+    *,
+    what: str = "a whole number",
+    mend: str = "change it",
+) -> int:
+    """A whole number from `low` to `high`. The arguments are those of `a_number`."""
+    if is_whole(value) and low <= value <= high:
+        return int(value)
+    raise error(f"{name}: expected {what}{_between(low, high)}, got {brief(value)}; {mend}")
+
+
+def numbers(name: str, value: object, error: Kind, length: int, what: str, mend: str = "change it") -> tuple[float, ...]:
+    """So many finite numbers, from a list, a tuple or an array."""
+    listed = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(listed, Sequence) and not isinstance(listed, str | bytes) and len(listed) == length and all(map(is_finite, listed)):
+        return tuple(float(number) for number in listed)
+    raise error(f"{name}: expected {what}, got {brief(value)}; {mend}")
+
+
+def a_flag(name: str, value: object, error: Kind) -> bool:
+    """True or false; numpy's, too."""
+    if isinstance(value, bool) or type(value).__name__ == "bool":  # numpy's, without loading numpy
+        return bool(value)
+    raise error(f"{name}: expected true or false, got {brief(value)}; take one of these")
+
+
+def a_text(name: str, value: object, error: Kind, *, mend: str = "give a text") -> str:
+    """A text, which may be empty."""
+    if isinstance(value, str):
+        return value
+    raise error(f"{name}: expected a text, got {brief(value)}; {mend}")
+
+
+def one_of(name: str, value: object, choices: Iterable[str], error: Kind, *, mend: str = "take one of these") -> str:
+    """One of several texts."""
+    known = list(choices)
+    if isinstance(value, str) and value in known:
+        return value
+    told = " or ".join(filter(None, (", ".join(known[:-1]), known[-1])))
+    raise error(f"{name}: expected {told}, got {brief(value)}; {mend}")
+
+
+def an_instance(name: str, value: object, kind: type[T], error: Kind, *, mend: str) -> T:
+    """A value of a class."""
+    if isinstance(value, kind):
+        return value
+    article = "an" if kind.__name__.startswith(("A", "E", "I", "O", "SSH")) else "a"
+    raise error(f"{name}: expected {article} {kind.__name__}, got {brief(value)}; {mend}")
+
+
+def all_instances(name: str, values: object, kind: type[T], error: Kind, *, mend: str) -> tuple[T, ...]:
+    """Values of a class, from anything that can be iterated over. Messages name the first one that is wrong."""
+    return tuple(an_instance(f"{name}[{i}]", value, kind, error, mend=mend) for i, value in enumerate(a_list(name, values, error)))
+
+
+def a_list(name: str, value: object, error: Kind, *, what: str = "a list", mend: str = "give a list") -> list[Any]:
+    """The members of a list, a tuple, an array, a generator or the like. A text, bytes and an object are no lists."""
+    if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
+        return list(value)
+    raise error(f"{name}: expected {what}, got {brief(value)}; {mend}")
+
+
+def an_object(name: str, value: object, error: Kind) -> Mapping[str, Any]:
+    """A mapping from names to values."""
+    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return value
+    raise error(f'{name}: expected an object, got {brief(value)}; write {{"name": value}}')
+
+
+def a_function(name: str, value: object, error: Kind, *, what: str) -> Callable[..., Any]:
+    """Anything that can be called."""
+    if callable(value):
+        return value
+    raise error(f"{name}: expected {what}, got {brief(value)}; give a function")
+
+
+def a_path(name: str, value: object, error: Kind) -> str:
+    """The path of a file, as a text. It may be empty, or hold what no path may hold: who opens the file says so."""
+    path = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if isinstance(path, str):
+        return path
+    raise error(f"{name}: expected the path of a file, as a text or a pathlib.Path, got {brief(value)}; name a file")
+
+
+def _between(low: float, high: float, above: float = -math.inf) -> str:
+    """The range of a number, in words."""
+
+    def told(number: float) -> str:
+        return f"{number:,.0f}" if number == round(number) else f"{number:g}"
+
+    if math.isfinite(above):
+        return f" above {told(above)}" + (f" and at most {told(high)}" if math.isfinite(high) else "")
+    if math.isfinite(low) and math.isfinite(high):
+        return f" from {told(low)} to {told(high)}"
+    return f", {told(low)} or more" if math.isfinite(low) else f", {told(high)} or less" if math.isfinite(high) else ""
