@@ -1,23 +1,23 @@
 """Reader of ROS bags, by the package rosbags (extra `ros`): files of ROS 1, folders and files of ROS 2, and MCAP. No ROS needs to be installed.
 
-Read are the laser's scans (sensor_msgs/LaserScan), the odometer's poses (nav_msgs/Odometry) and the transforms between frames (tf2_msgs/TFMessage), as ROS calls frames (REP 105):
+Read are the laser's scans (sensor_msgs/LaserScan, or the first echoes of MultiEchoLaserScan), the odometer's poses (nav_msgs/Odometry) and the transforms between frames
+(tf2_msgs/TFMessage), as ROS calls frames (REP 105):
 
 - Odometry is the pose in messages of Odometry, and where there are none the transform from `odom` to the robot. It is interpolated at the time of each scan.
-- The laser's mount is the transform from the robot's frame to that of the scans. A laser that hangs upside down turns clockwise.
+- The laser's mount is the transform from the robot's frame to that of the scan, for each scan by the frame that it names. A laser that hangs upside down turns clockwise.
 - Where somebody localised the robot, so that there are transforms from `map` to `odom`, the scans have corrected poses.
 
-Times are those of the messages' headers. Where these are missing, run backwards, or are those of different clocks, they are the times at which messages were recorded.
+Times are those of the messages' headers. Where these contradict themselves or each other, they are the times at which messages were recorded (`poses`).
 """
 
 from __future__ import annotations
 
 import math
 import os
-import tempfile
-from array import array
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -26,19 +26,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
+from perception.readers import bag_files
+from perception.readers.bag_files import cause
+from perception.readers.poses import Poses, Track, clock_of, sources_of
 from perception.readers.scans import Damage, Laser, Pose, Reading, Scan
 from ssh_abduction.errors import brief, named
-from ssh_abduction.odometry import moved
+from ssh_abduction.odometry import between, moved
 
-# How a file begins, and what its name has to end in for rosbags.
-MAGICS = {b"#ROSBAG V": ("ros1", ".bag"), b"\x89MCAP0\r\n": ("mcap", ".mcap"), b"SQLite format 3\0": ("ros2", ".db3")}
-SCANS, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
+SCANS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan")
+ODOMETRY = ("nav_msgs/msg/Odometry",)
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 NANO = 1e-9
-# Odometry that ends, or begins, so many seconds beside a scan still tells where the scan was taken.
-BESIDE = 1.0
-# Clocks that differ by more seconds are different clocks.
-SAME_CLOCK = 1.0
+# A transform that never moves differs from one message to the next by rounding alone: metres and radians.
+FIXED = (0.01, 0.01)
 
 
 class _Damaged(Exception):  # noqa: N818 - becomes a Damage
@@ -46,210 +46,155 @@ class _Damaged(Exception):  # noqa: N818 - becomes a Damage
 
 
 @dataclass
-class _Track:
-    """Poses over time, which come one after another. Each has two times: that of its header, 0 where there is none, and that at which it was recorded."""
-
-    numbers: array[float] = field(default_factory=lambda: array("d"))
-
-    def add(self, stamp: float, recorded: float, pose: Pose) -> None:
-        self.numbers.extend((stamp, recorded, *pose))
-
-    def table(self) -> NDArray[np.float64]:
-        """(n, 5): both times, and the pose."""
-        return np.frombuffer(self.numbers, dtype=np.float64).reshape(-1, 5)
-
-
-@dataclass(frozen=True)
-class _Poses:
-    """Poses over time, (n,) and (n, 3), in the order of time and with headings that do not jump."""
-
-    times: NDArray[np.float64]
-    poses: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, track: _Track, by_stamp: bool) -> _Poses:
-        table = track.table()
-        times = table[:, 0 if by_stamp else 1]
-        order = np.argsort(times, kind="stable")
-        poses = table[order, 2:].copy()
-        poses[:, 2] = np.unwrap(poses[:, 2])
-        return cls(times[order], poses)
-
-    def at(self, time: float) -> Pose:
-        x, y, heading = (float(np.interp(time, self.times, self.poses[:, i])) for i in range(3))
-        return x, y, math.remainder(heading, math.tau)
-
-    def tells(self, time: float) -> bool:
-        return bool(self.times[0] - BESIDE <= time <= self.times[-1] + BESIDE)
-
-
-@dataclass
 class _Frame:
     """The transform from a frame's parent to the frame.
 
-    translation, rotation  the first one, (3,) and (3, 3)
-    track                  those that came over time, in the plane; None where it never changes
+    translation, rotation  the last one, (3,) and (3, 3)
+    first                  the first one, in the plane
+    track                  those that came over time, in the plane; None for one that never changes
+    count                  how many came
+    off                    by how much others differ from the first, at most, in metres and radians
     """
 
     parent: str
     translation: NDArray[np.float64]
     rotation: NDArray[np.float64]
-    track: _Track | None
+    first: Pose
+    track: Track | None
+    count: int = 0
+    off: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def is_fixed(self) -> bool:
+        return self.off[0] <= FIXED[0] and self.off[1] <= FIXED[1]
+
+
+# The transforms to each frame, by its parents. A frame should have one parent, but some have more.
+_Frames = dict[str, dict[str, _Frame]]
 
 
 class Bag:
     """An open bag."""
 
-    def __init__(self, reader: Any, store: Any, format: str, source: str) -> None:
-        self.reader, self.format, self.source = reader, format, source
-        self.deserialize = store.deserialize_ros1 if format == "ros1" else store.deserialize_cdr
+    def __init__(self, files: bag_files.Files, store: Any, source: str) -> None:
+        self.readers, self.format, self.notes, self.source = files.readers, files.format, files.notes, source
+        self.deserialize = store.deserialize_ros1 if files.format == "ros1" else store.deserialize_cdr
+
+    @property
+    def connections(self) -> list[Any]:
+        return [connection for reader in self.readers for connection in reader.connections]
 
     def topics(self, *kinds: str) -> dict[str, int]:
         """The topics of some kinds, or all, and how many messages each has."""
         counts: dict[str, int] = {}
-        for connection in self.reader.connections:
+        for connection in self.connections:
             if not kinds or connection.msgtype in kinds:
                 counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
         return counts
 
     def listed(self) -> str:
         """All topics with their kinds, as messages list them."""
-        topics = dict.fromkeys(f"{c.topic} ({c.msgtype.rpartition('/')[2]})" for c in self.reader.connections)
+        topics = dict.fromkeys(f"{c.topic} ({c.msgtype.rpartition('/')[2]})" for c in self.connections)
         return ", ".join(list(topics)[:20]) + (", …" if len(topics) > 20 else "") if topics else "none"
 
-    def messages(self, topics: set[str]) -> Iterator[tuple[str, int, float, Any]]:
-        """The messages of some topics: topic, number among those of the topic, time of recording, and the message, or the Damage that it is."""
+    def messages(self, topics: set[str]) -> Iterator[tuple[Any, int, float, Any]]:
+        """The messages of some topics: connection, number among those of the topic, time of recording, and the message, or the Damage that it is."""
         from rosbags.serde import SerdeError
 
-        connections = [c for c in self.reader.connections if c.topic in topics]
         numbers = dict.fromkeys(topics, 0)
-        stored = self.reader.messages(connections=connections) if connections else iter(())
-        while True:
-            try:
-                connection, time, raw = next(stored)
-            except StopIteration:
-                return
-            except Exception as error:  # whatever a library runs into in damaged bytes
-                number = sum(numbers.values()) + 1
-                where = " and ".join(sorted(topics))
-                yield (
-                    "",
-                    number,
-                    0.0,
-                    Damage(number, f"{where}: expected a message, got damaged data ({_cause(error)}); what follows was not read"),
-                )
-                return
-            topic = connection.topic
-            numbers[topic] += 1
-            try:
-                yield topic, numbers[topic], time * NANO, self.deserialize(raw, connection.msgtype)
-            except (SerdeError, ValueError, IndexError) as error:
-                what = f"{topic}: expected a message {connection.msgtype.rpartition('/')[2]}, got damaged data ({_cause(error)})"
-                yield topic, numbers[topic], time * NANO, Damage(numbers[topic], what)
-
-
-def format_of(head: bytes) -> str | None:
-    """The format of a file that begins in some way; None where it is no bag."""
-    return next((name for magic, (name, _) in MAGICS.items() if head.startswith(magic)), None)
+        for reader in self.readers:
+            connections = [c for c in reader.connections if c.topic in topics]
+            stored = reader.messages(connections=connections) if connections else iter(())
+            while True:
+                try:
+                    connection, time, raw = next(stored)
+                except StopIteration:
+                    break
+                except Exception as error:  # whatever a library runs into in damaged bytes
+                    bag_files.check_room(error, self.source)
+                    number = sum(numbers.values()) + 1
+                    where = " and ".join(sorted(topics))
+                    what = f"{where}: expected a message, got damaged data ({cause(error)}); what follows was not read"
+                    yield connections[0], number, 0.0, Damage(number, what)
+                    break
+                topic = connection.topic
+                numbers[topic] += 1
+                try:
+                    yield connection, numbers[topic], time * NANO, self.deserialize(raw, connection.msgtype)
+                except (SerdeError, ValueError, IndexError) as error:
+                    what = f"{topic}: expected a message {connection.msgtype.rpartition('/')[2]}, got damaged data ({cause(error)})"
+                    yield connection, numbers[topic], time * NANO, Damage(numbers[topic], what)
 
 
 @contextmanager
 def opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
     """An open bag of a format. Raises LogError."""
-    try:
-        from rosbags import rosbag1, rosbag2
+    with bag_files.opened(Path(path), format) as files:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError:
-        raise LogError(f"{named(path)}: expected the package rosbags to read it with, got none; pip install 'ssh-abduction[ros]'") from None
-    is_ros1 = format == "ros1"
-    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    for kind in TRANSFORMS:
-        if kind not in store.fielddefs:
-            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
-    with tempfile.TemporaryDirectory() as folder:
-        file = _with_suffix(Path(path), Path(folder))
-        try:
-            reader: Any = rosbag1.Reader(file) if is_ros1 else rosbag2.Reader(file)
-            reader.open()
-        except Exception as error:  # whatever a library runs into in damaged bytes
-            raise LogError(
-                f"{named(path)}: expected a bag ({format}), got one that cannot be opened ({_cause(error)}); index it again (rosbag reindex, ros2 bag reindex, mcap recover), or record it anew"
-            ) from None
-        try:
-            yield Bag(reader, store, format, named(path))
-        finally:
-            reader.close()
+
+        store = get_typestore(Stores.ROS1_NOETIC if files.format == "ros1" else Stores.ROS2_HUMBLE)
+        for kind in TRANSFORMS:
+            if kind not in store.fielddefs:
+                store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
+        yield Bag(files, store, named(path))
 
 
-def _with_suffix(path: Path, folder: Path) -> Path:
-    """The path under a name from which rosbags knows what it is, whatever the file is called. Raises LogError for a folder that is no bag."""
-    if path.is_dir():
-        if (path / "metadata.yaml").exists():
-            return path
-        inside = sorted((*path.glob("*.mcap"), *path.glob("*.db3")))
-        if len(inside) != 1:
-            raise LogError(
-                f"{named(path)}: expected a folder of ROS 2 with metadata.yaml, or with one file *.mcap or *.db3, got {len(inside)} of these; name a file"
-            )
-        return inside[0]
-    with path.open("rb") as file:
-        head = file.read(16)
-    suffix = next((suffix for magic, (_, suffix) in MAGICS.items() if head.startswith(magic)), path.suffix)
-    if path.suffix == suffix:
-        return path
-    link = folder / f"bag{suffix}"
-    link.symlink_to(path.resolve())
-    return link
+def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Reading:
+    """A bag, surveyed.
 
+    Args:
+        bag: The open bag.
+        scan_topics: The topics of the scans; none for the only one.
+        odom_topic: The topic of the odometry; None for the only one, or for transforms.
 
-def read(bag: Bag, scan_topic: str | None, odom_topic: str | None) -> Reading:
-    """A bag, surveyed. Raises LogError where it holds no scan or no odometry, or where several topics could be meant and none is named."""
-    notes: list[str] = []
-    scans = _chosen(bag, SCANS, scan_topic, "scan")
-    if scans is None:
-        raise LogError(f"{bag.source}: expected scans (messages LaserScan), got none; topics: {bag.listed()}; record the laser, too")
+    Raises:
+        LogError: It holds no scan or no odometry, or several topics could be meant and none is named.
+    """
+    notes = list(bag.notes)
+    scans = _scan_topics(bag, scan_topics)
     odometers = _chosen(bag, ODOMETRY, odom_topic, "odom")
-    frame, laser_offset = _first_scan(bag, scans)
+    times, seen = _survey(bag, scans)
+    said = " and ".join(scans)
     damaged: list[Damage] = []
-    frames = _frames(bag, frame, damaged)
-    chain = _ancestors(frames, frame)
+    frames = _frames(bag, set(seen), damaged)
+    frame = seen.most_common(1)[0][0]
     if odometers is not None:
-        odometer, odom, base = _odometer(bag, odometers, damaged)
-        notes.append(f"Scans are those of {scans}, odometry that of {odometers}.")
-        if not odometer.numbers:
-            raise LogError(f"{bag.source}: expected odometry in {odometers}, got none that can be read")
+        odometer, odom, base = _odometer(bag, odometers, damaged, notes)
+        notes.insert(len(bag.notes), f"Scans are those of {said}, odometry that of {odometers}.")
+        called = odometers
     else:
-        edge = next(
-            (child for child in chain if "odom" in frames[child].parent.rpartition("/")[2] and frames[child].track is not None), None
-        )
-        edge = edge or next((child for child in chain if frames[child].track is not None), None)
-        if edge is None:
-            raise LogError(
-                f"{bag.source}: expected odometry (messages Odometry, or transforms from odom to the frame {frame!r} of the scans), got none; topics: {bag.listed()}"
-            )
-        found = frames[edge].track
-        assert found is not None
-        odometer, odom, base = found, frames[edge].parent, edge
-        notes.append(f"Scans are those of {scans}. There are no messages Odometry: odometry is the transform from {odom} to {base}.")
-    mount, is_flipped = _mount(frames, chain, odom, base, frame, notes)
-    above = [track for child in _ancestors(frames, odom) if (track := frames[child].track) is not None]
-    by_stamp = all(_has_one_clock(track, laser_offset) for track in (odometer, *above))
-    if not by_stamp:
+        odometer, odom, base = _odometer_of_transforms(bag, frames, frame)
+        notes.append(f"Scans are those of {said}. There are no messages Odometry: odometry is the transform from {odom} to {base}.")
+        called = f"the transforms from {odom} to {base}"
+    odometer = _of_one_source(odometer, called, notes)
+    mounts = {frame: _mount(frames, odom, base, frame, notes) for frame in seen}
+    if len(seen) > 1:
         notes.append(
-            "The times in the headers of the messages are missing, run backwards, or are those of different clocks: the times of recording are used."
+            f"The scans are of several frames ({', '.join(f'{count} of {name}' for name, count in seen.most_common())}): each is mounted as its own frame says."
         )
-    corrections = [_Poses.of(track, by_stamp) for track in above]
-    if corrections:
+    above = [track for child in _ancestors(frames, odom) if (track := _parent(frames, child).track) is not None]
+    corrections = {f"the transforms above {odom}": track for track in above}
+    clocks = {called: odometer.table()[:, :2], **times, **{name: track.table()[:, :2] for name, track in corrections.items()}}
+    by_stamp, contradictions = clock_of(clocks)
+    notes += contradictions
+    if above:
         notes.append(f"Corrected poses are those of the transforms above {odom}.")
-    return Reading(
-        bag.format, tuple(notes), _scans(bag, scans, _Poses.of(odometer, by_stamp), corrections, mount, is_flipped, by_stamp, damaged)
-    )
+    where = _Where(Poses.of(odometer, by_stamp), [Poses.of(track, by_stamp) for track in above], mounts, by_stamp)
+    return Reading(bag.format, tuple(notes), _scans(bag, set(scans), where, damaged))
 
 
-def _chosen(bag: Bag, kind: str, name: str | None, option: str) -> str | None:
-    """The topic of a kind: the one that is named, or the only one; None where there is none."""
-    counts = {topic: count for topic, count in bag.topics(kind).items() if count}
-    short = kind.rpartition("/")[2]
+def _scan_topics(bag: Bag, named: Sequence[str]) -> list[str]:
+    """The topics of the scans. Raises LogError where there are none, or several and none is named."""
+    found = [_chosen(bag, SCANS, name, "scan") for name in named or (None,)]
+    if found == [None]:
+        raise LogError(f"{bag.source}: expected scans (messages LaserScan), got none; topics: {bag.listed()}; record the laser, too")
+    return list(dict.fromkeys(topic for topic in found if topic is not None))
+
+
+def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> str | None:
+    """The topic of some kinds: the one that is named, or the only one; None where there is none."""
+    counts = {topic: count for topic, count in bag.topics(*kinds).items() if count}
+    short = kinds[0].rpartition("/")[2]
     listed = ", ".join(f"{topic} ({count} messages)" for topic, count in sorted(counts.items())) or "none"
     if name is not None:
         match = [topic for topic in counts if topic.strip("/") == name.strip("/")]
@@ -257,22 +202,28 @@ def _chosen(bag: Bag, kind: str, name: str | None, option: str) -> str | None:
             raise LogError(f"{bag.source}: --{option}-topic: expected a topic of {short}, got {brief(name)}; those in the bag: {listed}")
         return match[0]
     if len(counts) > 1:
-        raise LogError(f"{bag.source}: expected one topic of {short}, got {len(counts)}: {listed}; name one with --{option}-topic")
+        several = ", once for each that is to be read" if option == "scan" else ""
+        raise LogError(f"{bag.source}: expected one topic of {short}, got {len(counts)}: {listed}; name one with --{option}-topic{several}")
     return next(iter(counts), None)
 
 
-def _first_scan(bag: Bag, topic: str) -> tuple[str, float]:
-    """The frame of the first scan that can be read, and by how much the time of its header is ahead of that of its recording."""
-    for _, _, recorded, message in bag.messages({topic}):
+def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float64]], Counter[str]]:
+    """The two times of the scans of each topic, (n, 2), and how many scans name each frame."""
+    times: dict[str, list[tuple[float, float]]] = {}
+    frames: Counter[str] = Counter()
+    for connection, _, recorded, message in bag.messages(set(topics)):
         if not isinstance(message, Damage):
-            return _name(message.header.frame_id), _stamp(message.header) - recorded
-    raise LogError(f"{bag.source}: expected scans in {topic}, got none that can be read")
+            times.setdefault(connection.topic, []).append((_stamp(message.header), recorded))
+            frames[_name(message.header.frame_id)] += 1
+    if not frames:
+        raise LogError(f"{bag.source}: expected scans in {' and '.join(topics)}, got none that can be read")
+    return {topic: np.array(both) for topic, both in times.items()}, frames
 
 
-def _odometer(bag: Bag, topic: str, damaged: list[Damage]) -> tuple[_Track, str, str]:
-    """The odometer's poses, the frame in which they are, and the robot's frame."""
-    track, odom, base = _Track(), "", ""
-    for _, number, recorded, message in bag.messages({topic}):
+def _odometer(bag: Bag, topic: str, damaged: list[Damage], notes: list[str]) -> tuple[Track, str, str]:
+    """The odometer's poses, the frame in which they are, and the robot's frame. Raises LogError."""
+    tracks: dict[tuple[str, str, str], Track] = {}
+    for connection, number, recorded, message in bag.messages({topic}):
         if isinstance(message, Damage):
             damaged.append(message)
             continue
@@ -282,52 +233,118 @@ def _odometer(bag: Bag, topic: str, damaged: list[Damage]) -> tuple[_Track, str,
         except _Damaged as damage:
             damaged.append(Damage(number, f"{topic}: {damage}"))
             continue
-        odom, base = odom or _name(message.header.frame_id), base or _name(message.child_frame_id)
-        track.add(_stamp(message.header), recorded, flat)
-    return track, odom, base
+        source = _name(message.header.frame_id), _name(message.child_frame_id), getattr(connection.ext, "callerid", "") or ""
+        tracks.setdefault(source, Track()).add(_stamp(message.header), recorded, flat)
+    if not tracks:
+        raise LogError(f"{bag.source}: expected odometry in {topic}, got none that can be read")
+    best = max(tracks, key=lambda source: (len(tracks[source].numbers), "odom" in source[0]))
+    if len(tracks) > 1:
+
+        def told(source: tuple[str, str, str]) -> str:
+            odom, base, sender = source
+            return f"from {odom} to {base}{f' by {sender}' if sender else ''}"
+
+        listed = ", ".join(f"{len(track.table())} {told(source)}" for source, track in tracks.items())
+        notes.append(f"Several sources publish {topic}: {listed}. Those {told(best)} are read; record each source to a topic of its own.")
+    return tracks[best], best[0], best[1]
 
 
-def _frames(bag: Bag, frame: str, damaged: list[Damage]) -> dict[str, _Frame]:
-    """The transforms to frames, by their names. Those that change are kept over time for the ancestors of a frame alone, as a robot has many joints."""
-    frames: dict[str, _Frame] = {}
+def _odometer_of_transforms(bag: Bag, frames: _Frames, frame: str) -> tuple[Track, str, str]:
+    """The same of the transforms from `odom` to the robot. Raises LogError."""
+    chain = [(child, _parent(frames, child)) for child in _ancestors(frames, frame)]
+    moving = [(child, one) for child, one in chain if one.track is not None]
+    found = next(((child, one) for child, one in moving if "odom" in one.parent.rpartition("/")[2]), None) or next(iter(moving), None)
+    if found is None:
+        raise LogError(
+            f"{bag.source}: expected odometry (messages Odometry, or transforms from odom to the frame {frame!r} of the scans), got none; topics: {bag.listed()}"
+        )
+    base, edge = found
+    assert edge.track is not None
+    return edge.track, edge.parent, base
+
+
+def _of_one_source(track: Track, called: str, notes: list[str]) -> Track:
+    """The poses of one source, where those of several alternate."""
+    sources = sources_of(track)
+    if len(sources) == 1:
+        return track
+    table = track.table()
+    first, second = (Track() for _ in range(2))
+    for number in sources[0]:
+        first.numbers.extend(table[number])
+    for number in sources[1]:
+        second.numbers.extend(table[number])
+    here, there = Poses.of(first, False), Poses.of(second, False)
+    apart = max(math.dist(here.at(time)[:2], there.at(time)[:2]) for time in there.times)
+    notes.append(
+        f"Several sources publish {called}, whose poses alternate, up to {apart:.1f} m apart: {len(sources[0])} and {len(sources[1])} of {len(table)} messages. "
+        "The first of these is read; stop the other, and record again, if it is the better one."
+    )
+    return first
+
+
+def _frames(bag: Bag, seen: set[str], damaged: list[Damage]) -> _Frames:
+    """The transforms to frames. Those that change are kept over time for the ancestors of the scans' frames alone, as a robot has many joints."""
+    frames: _Frames = {}
     topics = set(bag.topics(*TRANSFORMS))
     fixed = {topic for topic in topics if topic.endswith("tf_static")}
-    for group, is_fixed in ((fixed, True), (topics - fixed, False)):
-        for topic, number, recorded, message in bag.messages(group):
+    for group, is_static in ((fixed, True), (topics - fixed, False)):
+        for connection, number, recorded, message in bag.messages(group):
             if isinstance(message, Damage):
                 damaged.append(message)
                 continue
             for stamped in message.transforms:
                 child, parent = _name(stamped.child_frame_id), _name(stamped.header.frame_id)
-                move, turn = stamped.transform.translation, stamped.transform.rotation
                 try:
-                    flat = _flat(move, turn)
-                    if child not in frames:
-                        track = None if is_fixed else _Track()
-                        frames[child] = _Frame(parent, np.array([move.x, move.y, move.z]), _rotation(turn), track)
+                    edge = _heard(frames, child, parent, stamped.transform, is_static)
                 except _Damaged as damage:
-                    damaged.append(Damage(number, f"{topic}: {child}: {damage}"))
+                    damaged.append(Damage(number, f"{connection.topic}: {child}: {damage}"))
                     continue
-                track = frames[child].track
-                if track is not None and (not track.numbers or child in _ancestors(frames, frame)):
-                    track.add(_stamp(stamped.header), recorded, flat)
+                if edge.track is not None and (edge.count == 1 or any(child in _ancestors(frames, frame) for frame in seen)):
+                    edge.track.add(_stamp(stamped.header), recorded, _flat(stamped.transform.translation, stamped.transform.rotation))
     return frames
 
 
-def _ancestors(frames: dict[str, _Frame], frame: str) -> list[str]:
+def _heard(frames: _Frames, child: str, parent: str, transform: Any, is_static: bool) -> _Frame:
+    """The transform to a frame, once another message of it came. Raises _Damaged."""
+    move, turn = transform.translation, transform.rotation
+    flat = _flat(move, turn)
+    parents = frames.setdefault(child, {})
+    edge = parents.get(parent)
+    if edge is None or (edge.track is None) != is_static:
+        edge = _Frame(parent, np.zeros(3), np.eye(3), flat, None if is_static else Track())
+    parents.pop(parent, None)
+    parents[parent] = edge  # the last parent comes last
+    edge.translation = np.array([move.x, move.y, move.z])
+    if edge.track is None or edge.count == 0 or edge.off != (0.0, 0.0) or flat != edge.first:
+        edge.rotation = _rotation(turn)
+    edge.count += 1
+    x, y, angle = between(edge.first, flat)
+    edge.off = max(edge.off[0], math.hypot(x, y)), max(edge.off[1], abs(angle))
+    return edge
+
+
+def _parent(frames: _Frames, child: str) -> _Frame:
+    """The transform to a frame from its parent: from the frame of the odometry where that is one of several, else from the one that came last."""
+    parents = list(frames[child].values())
+    return next((one for one in parents if "odom" in one.parent.rpartition("/")[2]), parents[-1])
+
+
+def _ancestors(frames: _Frames, frame: str) -> list[str]:
     """The frame, its parent, and so on, as far as there are transforms to them."""
     chain: list[str] = []
     while frame in frames and frame not in chain:
         chain.append(frame)
-        frame = frames[frame].parent
+        frame = _parent(frames, frame).parent
     return chain
 
 
-def _mount(frames: dict[str, _Frame], chain: list[str], odom: str, base: str, frame: str, notes: list[str]) -> tuple[Pose, bool]:
+def _mount(frames: _Frames, odom: str, base: str, frame: str, notes: list[str]) -> tuple[Pose, bool]:
     """The laser's pose in the frame of the robot, and whether it hangs upside down."""
     if base == frame:
         return (0.0, 0.0, 0.0), False
-    parents = [frames[child].parent for child in chain]
+    chain = _ancestors(frames, frame)
+    parents = [_parent(frames, child).parent for child in chain]
     top = parents.index(base) if base in parents else parents.index(odom) - 1 if odom in parents else None
     if top is None:
         notes.append(
@@ -336,51 +353,69 @@ def _mount(frames: dict[str, _Frame], chain: list[str], odom: str, base: str, fr
         return (0.0, 0.0, 0.0), False
     translation, rotation = np.zeros(3), np.eye(3)
     for child in reversed(chain[: top + 1]):
-        translation = translation + rotation @ frames[child].translation
-        rotation = rotation @ frames[child].rotation
+        edge = _parent(frames, child)
+        translation = translation + rotation @ edge.translation
+        rotation = rotation @ edge.rotation
+        if not edge.is_fixed:
+            off, angle = edge.off[0], math.degrees(edge.off[1])
+            notes.append(
+                f"The {edge.count} transforms from {edge.parent} to {child}, by which the laser is mounted, contradict each other by up to {off:.2f} m and {angle:.0f} degrees: the last one is used."
+            )
+        if len(frames[child]) > 1:
+            others = ", ".join(f"{one.parent} ({one.count} transforms)" for one in frames[child].values())
+            notes.append(f"The frame {child} has several parents, {others}: that from {edge.parent} is used for the laser's mount.")
     heading = math.atan2(rotation[1, 0], rotation[0, 0])
     x, y, angle = (round(float(v), 6) for v in (translation[0], translation[1], heading))
     return (x, y, angle), bool(rotation[2, 2] < 0)
 
 
-def _has_one_clock(track: _Track, laser_offset: float) -> bool:
-    """Whether the times in headers can be used."""
-    table = track.table()
-    stamps = table[:, 0]
-    if not stamps.any() or (np.diff(stamps) < -SAME_CLOCK).any():
-        return False
-    return bool(abs(stamps[0] - table[0, 1] - laser_offset) <= SAME_CLOCK)
+@dataclass(frozen=True)
+class _Where:
+    """Where the robot and its lasers were.
+
+    corrections  transforms above the frame of the odometry, the nearest first
+    mounts       by the frame of a scan, the laser's pose in the frame of the robot, and whether it hangs upside down
+    """
+
+    odometry: Poses
+    corrections: list[Poses]
+    mounts: dict[str, tuple[Pose, bool]]
+    by_stamp: bool
+
+    def at(self, time: float) -> tuple[Pose, Pose | None]:
+        """The pose by the odometer, and the corrected one. Raises _Damaged."""
+        if not self.odometry.tells(time):
+            begin, end = self.odometry.times[[0, -1]]
+            raise _Damaged(f"expected odometry at the time of the scan, {time:.3f} s, got it from {begin:.3f} to {end:.3f} s")
+        pose = self.odometry.at(time)
+        corrected: Pose | None = pose if self.corrections else None
+        for correction in self.corrections:
+            assert corrected is not None
+            corrected = moved(correction.at(time), corrected)
+        return pose, corrected
 
 
-def _scans(
-    bag: Bag, topic: str, odometry: _Poses, corrections: list[_Poses], mount: Pose, is_flipped: bool, by_stamp: bool, damaged: list[Damage]
-) -> Iterator[Scan | Damage]:
+def _scans(bag: Bag, topics: set[str], where: _Where, damaged: list[Damage]) -> Iterator[Scan | Damage]:
     yield from damaged
-    for _, number, recorded, message in bag.messages({topic}):
+    for connection, number, recorded, message in bag.messages(topics):
         if isinstance(message, Damage):
             yield message
             continue
         try:
-            time = _stamp(message.header) if by_stamp else recorded
-            if not odometry.tells(time):
-                raise _Damaged(
-                    f"expected odometry at the time of the scan, {time:.3f} s, got it from {odometry.times[0]:.3f} to {odometry.times[-1]:.3f} s"
-                )
-            ranges, laser = _measured(message, mount, is_flipped)
-            pose = odometry.at(time)
-            corrected: Pose | None = None
-            if corrections:
-                corrected = pose
-                for correction in corrections:
-                    corrected = moved(correction.at(time), corrected)
+            time = _stamp(message.header) if where.by_stamp else recorded
+            pose, corrected = where.at(time)
+            ranges, laser = _measured(message, *where.mounts[_name(message.header.frame_id)])
             yield Scan(ranges, laser, pose, corrected, time, number)
         except _Damaged as damage:
-            yield Damage(number, f"{topic}: {damage}")
+            yield Damage(number, f"{connection.topic}: {damage}")
 
 
 def _measured(message: Any, mount: Pose, is_flipped: bool) -> tuple[NDArray[np.float64], Laser]:
     first, step, nearest, reach = (float(v) for v in (message.angle_min, message.angle_increment, message.range_min, message.range_max))
-    ranges = np.array(message.ranges, dtype=np.float64)
+    if message.__msgtype__ == SCANS[0]:
+        ranges = np.array(message.ranges, dtype=np.float64)
+    else:  # where nothing came back there is no echo
+        ranges = np.array([beam.echoes[0] if len(beam.echoes) else np.inf for beam in message.ranges], dtype=np.float64)
     if not len(ranges):
         raise _Damaged("expected at least one range, got none")
     if not math.isfinite(first) or not 0 < abs(step) <= math.tau:
@@ -423,7 +458,3 @@ def _stamp(header: Any) -> float:
 def _name(frame: str) -> str:
     """A frame's name; in ROS 1 it may begin with a slash."""
     return frame.lstrip("/")
-
-
-def _cause(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0].rstrip(".")[:200]

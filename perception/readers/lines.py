@@ -1,24 +1,37 @@
-"""The lines of a log, plain or gzipped, one at a time: a log of hours is never in memory as a whole, and a line without an end is not either."""
+"""The lines of a log, plain or packed, one at a time: a log of hours is never in memory as a whole, and a line without an end is not either.
+
+A packed file is known by its first bytes, whatever its name: gzip, bzip2, xz or zstd.
+"""
 
 from __future__ import annotations
 
+import bz2
+import errno
 import gzip
+import importlib
+import lzma
 import os
 import shutil
 import tempfile
 import zlib
 from codecs import BOM_UTF8
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, Any, cast
 
 from perception.errors import LogError
 from ssh_abduction.errors import named
 
 # What is longer is no line of a log: a scan of 10,000 beams is 100 kB.
 LONGEST_LINE = 2**20
-GZIP = b"\x1f\x8b"
+# How packed files begin, what packs them, and what unpacks them.
+PACKERS = {
+    b"\x1f\x8b": ("gzip", "zcat"),
+    b"BZh": ("bzip2", "bzcat"),
+    b"\xfd7zXZ\0": ("xz", "xzcat"),
+    b"\x28\xb5\x2f\xfd": ("zstd", "zstdcat"),
+}
 
 
 @contextmanager
@@ -39,7 +52,7 @@ def opened(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
                 yield file
                 return
             with tempfile.TemporaryFile() as copy:
-                shutil.copyfileobj(file, copy)
+                copied(file, copy, named(path))
                 yield cast(IO[bytes], copy)
     except OSError as error:
         raise _unreadable(path, error) from None
@@ -49,31 +62,109 @@ def _unreadable(path: str | os.PathLike[str], error: OSError) -> LogError:
     return LogError(f"{named(path)}: expected a readable log: {error.strerror or error}; check the path")
 
 
-def is_gzip(file: IO[bytes]) -> bool:
+def copied(file: IO[bytes], copy: IO[bytes], source: str) -> None:
+    """Copy a file to a temporary one.
+
+    Args:
+        file: The file, from where it is now.
+        copy: The temporary file.
+        source: The name of the file, for errors.
+
+    Raises:
+        LogError: The disk of temporary files is full.
+    """
+    try:
+        shutil.copyfileobj(file, copy, 2**20)
+        copy.flush()
+    except OSError as error:
+        raise (no_room(source) if is_full(error) else error) from None
+
+
+def no_room(source: str) -> LogError:
+    """The error that there is no room for temporary files."""
+    where = tempfile.gettempdir()
+    return LogError(
+        f"{source}: expected room for a temporary copy in {where}, got a full disk; free some, or name another folder (TMPDIR=FOLDER)"
+    )
+
+
+def is_full(error: BaseException) -> bool:
+    """Whether an error, SQLite's too, says that a disk is full."""
+    return getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or type(error).__name__ == "FullError"
+
+
+def packer(file: IO[bytes]) -> str | None:
+    """What packed a file (gzip, bzip2, xz or zstd), by its first bytes; None for a plain file."""
     file.seek(0)
-    return file.read(2) == GZIP
+    head = file.read(max(map(len, PACKERS)))
+    return next((name for magic, (name, _) in PACKERS.items() if head.startswith(magic)), None)
+
+
+def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
+    """The bytes of a file from its beginning, unpacked where it is packed.
+
+    Args:
+        file: The file.
+        source: Its name, for errors.
+
+    Returns:
+        A stream, which raises one of `damages()` where packed data are cut or damaged.
+
+    Raises:
+        LogError: The file was packed by zstd, and the package that unpacks it is missing.
+    """
+    found = packer(file)
+    file.seek(0)
+    if found is None:
+        return file
+    openers: dict[str, Callable[[IO[bytes]], Any]] = {"gzip": lambda f: gzip.GzipFile(fileobj=f), "bzip2": bz2.BZ2File, "xz": lzma.LZMAFile}
+    if found == "zstd":
+        if (zstd := zstd_module()) is None:
+            raise LogError(
+                f"{source}: expected the package backports.zstd to unpack it with (zstd), got none; pip install 'ssh-abduction[ros]', or unpack it with zstd -d"
+            )
+        openers["zstd"] = zstd.ZstdFile
+    return cast(IO[bytes], openers[found](file))
+
+
+def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
+    """The errors by which the streams of `unpacked` say that packed data are cut (EOFError) or damaged, and some others."""
+    zstd = zstd_module()
+    return (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, *((zstd.ZstdError,) if zstd else ()), *others)
+
+
+def zstd_module() -> Any:
+    """Python's module for zstd, or the package of the same content for Pythons before 3.14; None where there is neither."""
+    for name in ("compression.zstd", "backports.zstd"):
+        try:
+            return importlib.import_module(name)
+        except ImportError:
+            continue
+    return None
 
 
 def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
-    """The lines of a file from its beginning, unpacked if it is gzipped, whatever its name, each with its number, counted from 1.
+    """The lines of a file from its beginning, unpacked if it is packed, whatever its name, each with its number, counted from 1.
 
-    None stands for a line that is longer than LONGEST_LINE bytes. Raises LogError where gzipped data are cut or damaged, which says up to where they can be read.
+    None stands for a line that is longer than LONGEST_LINE bytes. Raises LogError where packed data are cut or damaged, which says up to where they can be read.
     """
-    zipped = is_gzip(file)
-    file.seek(0)
-    unpacked = cast(IO[bytes], gzip.GzipFile(fileobj=file)) if zipped else file
+    found = packer(file)
+    stream = unpacked(file, source)
     number = 0
     try:
-        while line := unpacked.readline(LONGEST_LINE + 1):
+        while line := stream.readline(LONGEST_LINE + 1):
             number += 1
             if len(line) <= LONGEST_LINE:
                 yield number, line if number > 1 else line.removeprefix(BOM_UTF8)
                 continue
             while line and not line.endswith(b"\n"):
-                line = unpacked.readline(LONGEST_LINE)
+                line = stream.readline(LONGEST_LINE)
             yield number, None
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+    except damages(OSError) as error:
+        if found is None:
+            raise
         what = "they end too early" if isinstance(error, EOFError) else str(error)
+        tool = dict(PACKERS.values())[found]
         raise LogError(
-            f"{source}: expected whole gzipped data, but after line {number} {what}; get the file again, or unpack what there is (zcat FILE > PART) and read that"
+            f"{source}: expected whole data of {found}, but after line {number} {what}; get the file again, or unpack what there is ({tool} FILE > PART) and read that"
         ) from None

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
 from perception.errors import LogError
-from perception.readers import bags, carmen
-from perception.readers.lines import LONGEST_LINE, is_gzip, lines, opened
+from perception.readers import bag_files, bags, carmen
+from perception.readers.lines import LONGEST_LINE, lines, opened
 from perception.readers.scans import Damage, Reading, RobotLog, Scan
 from ssh_abduction.errors import brief, named
 
@@ -26,12 +26,12 @@ HEAD = 2**16
 
 
 def read_log(
-    path: str | os.PathLike[str], format: str | None = None, *, scan_topic: str | None = None, odom_topic: str | None = None
+    path: str | os.PathLike[str], format: str | None = None, *, scan_topic: str | Sequence[str] | None = None, odom_topic: str | None = None
 ) -> RobotLog:
     """A robot's log.
 
     format                  one of FORMATS; where it is None it is guessed from what the file holds, never from its name
-    scan_topic, odom_topic  the topics of a bag that are to be read, where it has several of scans or of odometry
+    scan_topic, odom_topic  the topics of a bag that are to be read, where it has several of scans or of odometry. Scans may be those of several topics, in a sequence
 
     A damaged part is skipped, and stands in the log's `damaged`. Raises LogError where the file cannot be read, is of no known format, or holds no scan or no odometry.
     """
@@ -51,7 +51,7 @@ def read_log(
 
 
 def stream_log(
-    path: str | os.PathLike[str], format: str | None = None, *, scan_topic: str | None = None, odom_topic: str | None = None
+    path: str | os.PathLike[str], format: str | None = None, *, scan_topic: str | Sequence[str] | None = None, odom_topic: str | None = None
 ) -> Iterator[Scan | Damage]:
     """The scans of a robot's log one after another, and what was skipped, in the order of the file. Arguments and errors as for `read_log`."""
     with _reading(path, format, scan_topic, odom_topic) as reading:
@@ -59,24 +59,27 @@ def stream_log(
 
 
 @contextmanager
-def _reading(path: str | os.PathLike[str], format: str | None, scan_topic: str | None, odom_topic: str | None) -> Iterator[Reading]:
+def _reading(
+    path: str | os.PathLike[str], format: str | None, scan_topic: str | Sequence[str] | None, odom_topic: str | None
+) -> Iterator[Reading]:
+    topics = [scan_topic] if isinstance(scan_topic, str) else list(scan_topic or ())
     if format is not None and format not in FORMATS:
         raise LogError(f"format: expected one of {', '.join(FORMATS)}, got {brief(format)}")
     if _is_folder(path):
-        if format not in (None, "ros2", "mcap"):
+        if format in LINES:
             raise LogError(f"{named(path)}: expected a file of the format {format}, got a folder; name the file")
         with bags.opened(path, "ros2") as bag:
-            yield bags.read(bag, scan_topic, odom_topic)
+            yield bags.read(bag, topics, odom_topic)
         return
     with opened(path) as file:
         found = format or _format(file, named(path))
         if found in LINES:
-            if scan_topic is not None or odom_topic is not None:
+            if topics or odom_topic is not None:
                 raise LogError(f"{named(path)}: expected a bag, as a topic is named, got the format {found}; leave the topics out")
             yield carmen.read(file, named(path), format)
             return
     with bags.opened(path, found) as bag:
-        yield bags.read(bag, scan_topic, odom_topic)
+        yield bags.read(bag, topics, odom_topic)
 
 
 def _is_folder(path: str | os.PathLike[str]) -> bool:
@@ -98,9 +101,7 @@ def _format(file: IO[bytes], source: str) -> str:
     if not head:
         got = f"lines of more than {longest // 2**20} MiB" if longest else "an empty file"
         raise LogError(f"{source}: expected a robot's log, got {got}; formats: {formats}")
-    if (bag := bags.format_of(head)) is not None:
-        if is_gzip(file):
-            raise LogError(f"{source}: expected a bag ({bag}) as it was recorded, got a gzipped one; unpack it with gunzip")
+    if (bag := bag_files.format_of(head)) is not None:
         return bag
     if carmen.looks_like(head):
         return "carmen"

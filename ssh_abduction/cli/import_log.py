@@ -27,7 +27,9 @@ def add_parser(verbs: Verbs) -> None:
         "actions between. Corrected poses in a log become truth for evaluation; nothing that infers reads them."
     )
     parser = verbs.add_parser("import", help="make a trace of a robot's log", description=text)
-    parser.add_argument("log", help="CARMEN log or g2o-style log with scans (.gz too), ROS 1 bag, ROS 2 bag, or MCAP")
+    parser.add_argument(
+        "log", help="CARMEN log or g2o-style log with scans, ROS 1 bag, ROS 2 bag, or MCAP; packed by gzip, bzip2, xz or zstd, too"
+    )
     add_output(parser)
     add_reading(parser)
     parser.set_defaults(run=run)
@@ -37,7 +39,12 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     """Add the options that say how a log is read, and at which scale a building is looked at."""
     group = parser.add_argument_group("reading logs")
     group.add_argument("--format", choices=FORMATS, help="format of the log (default: guessed from what is in it)")
-    group.add_argument("--scan-topic", metavar="TOPIC", help="of a bag: the topic of the scans, where there are several")
+    group.add_argument(
+        "--scan-topic",
+        action="append",
+        metavar="TOPIC",
+        help="of a bag: the topic of the scans, where there are several; repeat it to read several lasers at once",
+    )
     group.add_argument("--odom-topic", metavar="TOPIC", help="of a bag: the topic of the odometry, where there are several")
     scale = parser.add_argument_group(
         "scale", "which ways out of a place count; the log itself suggests it by the passages that the robot drove through"

@@ -15,7 +15,10 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser = verbs.add_parser("map", help="map a building from a robot's log", description=text)
     parser.add_argument(
-        "logs", nargs="+", metavar="log", help="CARMEN log or g2o-style log with scans (.gz too), ROS 1 bag, ROS 2 bag, or MCAP"
+        "logs",
+        nargs="+",
+        metavar="log",
+        help="CARMEN log or g2o-style log with scans, ROS 1 bag, ROS 2 bag, or MCAP; packed by gzip, bzip2, xz or zstd, too",
     )
     parser.add_argument(
         "-o", "--output", type=output, required=True, metavar="FOLDER", help="folder to write; of several logs, the folder of their folders"

@@ -69,7 +69,7 @@ class MapQuestion:
 
     theory: Theory | None
     choices: dict[str, Any]
-    reading: tuple[str | None, str | None, str | None]
+    reading: tuple[str | None, list[str] | None, str | None]
     gateway: float | None
     radius: float | None
     doors: bool | None

@@ -1,0 +1,218 @@
+"""What is whole of a bag that rosbags cannot open: one that was cut, or never closed, so that its index is missing.
+
+Records are read from the beginning, one after another, up to the first that is not whole. Of a packed chunk that was cut, the messages before the cut are read, too.
+"""
+
+from __future__ import annotations
+
+import bz2
+import io
+import os
+import sqlite3
+import struct
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+from urllib.parse import quote
+
+from perception.readers.lines import damages, zstd_module
+
+NANO = 1_000_000_000
+# The kinds of records that hold something: of MCAP (https://mcap.dev/spec), and of ROS 1 (http://wiki.ros.org/Bags/Format/2.0).
+SCHEMA, CHANNEL, MCAP_MESSAGE, MCAP_CHUNK = 3, 4, 5, 6
+ROS1_MESSAGE, ROS1_CHUNK, CONNECTION = 2, 5, 7
+
+
+class Message(NamedTuple):
+    """A message: of which connection, its topic and kind, who sent it, nanoseconds at which it was recorded, and its bytes."""
+
+    connection: int
+    topic: str
+    msgtype: str
+    sender: str
+    time: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class _Sender:
+    """Who sent the messages of a connection, as rosbags says it of bags of ROS 1."""
+
+    callerid: str
+
+
+@dataclass(frozen=True)
+class Connection:
+    """The messages of one sender to one topic, with the fields of rosbags' connections that are read."""
+
+    id: int
+    topic: str
+    msgtype: str
+    msgcount: int
+    ext: _Sender
+
+
+class Salvage:
+    """The whole messages of a bag, read as by a reader of rosbags.
+
+    Args:
+        path: The file.
+        format: `ros1`, `ros2` (SQLite) or `mcap`.
+
+    Attributes:
+        connections: What can be read of.
+        count: How many whole messages there are.
+        seconds: From the first of them to the last.
+    """
+
+    def __init__(self, path: Path, format: str) -> None:
+        self._path, self._read = path, READERS[format]
+        found: dict[int, tuple[str, str, str]] = {}
+        counts: Counter[int] = Counter()
+        first, last = None, 0
+        for message in self._messages():
+            found.setdefault(message.connection, (message.topic, message.msgtype, message.sender))
+            counts[message.connection] += 1
+            first, last = message.time if first is None else first, message.time
+        self.connections = [
+            Connection(number, topic, kind, counts[number], _Sender(sender)) for number, (topic, kind, sender) in found.items()
+        ]
+        self.count = counts.total()
+        self.seconds = (last - (first or 0)) / NANO
+
+    def messages(self, connections: Collection[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
+        asked = {connection.id: connection for connection in connections}
+        for message in self._messages():
+            if message.connection in asked:
+                yield asked[message.connection], message.time, message.data
+
+    def close(self) -> None:
+        """Nothing is open between two calls."""
+
+    def _messages(self) -> Iterator[Message]:
+        try:
+            yield from self._read(self._path)
+        except damages(OSError, struct.error, LookupError, ValueError, RuntimeError, sqlite3.Error):
+            return  # here the whole part ends
+
+
+def _mcap(path: Path) -> Iterator[Message]:
+    kinds: dict[int, str] = {}
+    channels: dict[int, tuple[str, str]] = {}
+    with path.open("rb") as file:
+        file.seek(8)
+        for kind, data in _mcap_records(file, os.fstat(file.fileno()).st_size):
+            if kind == SCHEMA:
+                kinds[struct.unpack_from("<H", data)[0]] = _text(data, 2)[0]
+            elif kind == CHANNEL:
+                number, schema = struct.unpack_from("<HH", data)
+                topic, end = _text(data, 4)
+                if _text(data, end)[0] == "cdr":
+                    channels[number] = topic, kinds.get(schema, "")
+            elif kind == MCAP_MESSAGE:
+                number, _, time = struct.unpack_from("<HIQ", data)
+                if number in channels:
+                    yield Message(number, *channels[number], "", time, data[22:])
+
+
+def _mcap_records(stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
+    """The whole records of a stream of so many bytes, those within chunks, too: kind and content."""
+    while len(head := stream.read(9)) == 9:
+        kind, length = struct.unpack("<BQ", head)
+        data = stream.read(min(length, size))
+        if kind == MCAP_CHUNK:
+            packed, end = _text(data, 28)
+            content = _unpacked(packed, data[end + 8 :])
+            yield from _mcap_records(io.BytesIO(content), len(content))
+        elif len(data) == length:
+            yield kind, data
+        if len(data) < length:
+            return
+
+
+def _ros1(path: Path) -> Iterator[Message]:
+    connections: dict[int, tuple[str, str, str]] = {}
+    with path.open("rb") as file:
+        file.readline()
+        for header, data in _ros1_records(file, os.fstat(file.fileno()).st_size):
+            kind = header[b"op"][0]
+            if kind not in (CONNECTION, ROS1_MESSAGE):
+                continue
+            number = struct.unpack("<I", header[b"conn"])[0]
+            if kind == CONNECTION:
+                told = _fields(data)
+                package, _, name = told[b"type"].decode().partition("/")
+                connections[number] = header[b"topic"].decode(), f"{package}/msg/{name}", told.get(b"callerid", b"").decode()
+            elif number in connections:
+                seconds, nano = struct.unpack("<II", header[b"time"])
+                yield Message(number, *connections[number], seconds * NANO + nano, data)
+
+
+def _ros1_records(stream: IO[bytes], size: int) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
+    """The whole records of a stream of so many bytes, those within chunks, too: the fields of the header, and content."""
+
+    def part() -> tuple[bytes, bool]:
+        """The next part of a record, and whether it is whole."""
+        length = int.from_bytes(head, "little") if len(head := stream.read(4)) == 4 else size + 1
+        data = stream.read(min(length, size))
+        return data, len(data) == length
+
+    whole = True
+    while whole:
+        header, whole = part()
+        if not whole:
+            return
+        data, whole = part()
+        fields = _fields(header)
+        if fields[b"op"][0] == ROS1_CHUNK:
+            content = _unpacked(fields[b"compression"].decode(), data)
+            yield from _ros1_records(io.BytesIO(content), len(content))
+        elif whole:
+            yield fields, data
+
+
+def _sqlite(path: Path) -> Iterator[Message]:
+    with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro&immutable=1", uri=True)) as database:
+        database.execute("PRAGMA writable_schema=ON")  # else SQLite refuses a file that is shorter than its first page says
+        topics = {number: (topic, kind) for number, topic, kind in database.execute("SELECT id, name, type FROM topics")}
+        for number, time, data in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"):
+            if number in topics and isinstance(data, bytes):
+                yield Message(number, *topics[number], "", time, data)
+
+
+READERS: dict[str, Callable[[Path], Iterator[Message]]] = {"mcap": _mcap, "ros1": _ros1, "ros2": _sqlite}
+
+
+def _text(data: bytes, at: int) -> tuple[str, int]:
+    """A text behind its length, and where it ends."""
+    (length,) = struct.unpack_from("<I", data, at)
+    end = at + 4 + length
+    return data[at + 4 : end].decode(), end
+
+
+def _fields(data: bytes) -> dict[bytes, bytes]:
+    """The fields of a header of ROS 1, by their names."""
+    found: dict[bytes, bytes] = {}
+    at = 0
+    while at < len(data):
+        end = at + 4 + int(struct.unpack_from("<I", data, at)[0])
+        name, _, value = data[at + 4 : end].partition(b"=")
+        found[name], at = value, end
+    return found
+
+
+def _unpacked(packed: str, data: bytes) -> bytes:
+    """The content of a chunk as far as it is there. Raises KeyError for a packer that is not known."""
+    if packed in ("", "none"):
+        return data
+    from lz4.frame import LZ4FrameDecompressor
+
+    unpackers: dict[str, Callable[[], Any]] = {
+        "bz2": bz2.BZ2Decompressor,
+        "lz4": LZ4FrameDecompressor,
+        "zstd": zstd_module().ZstdDecompressor,
+    }
+    return bytes(unpackers[packed]().decompress(data))

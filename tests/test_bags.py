@@ -1,0 +1,394 @@
+"""Bags as robots leave them: in parts, packed, cut, with clocks that part, with several lasers, and odometry of several sources."""
+
+from __future__ import annotations
+
+import bz2
+import errno
+import gzip
+import lzma
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_readers import SMALL, Messages, agree, bag, drive
+
+from perception.errors import LogError
+from perception.readers.lines import zstd_module
+from perception.readers.logs import read_log
+from perception.readers.scans import Pose
+from perception.readers.writers import write_bag, write_carmen
+from ssh_abduction.cli import main
+
+SCANS = drive(40, SMALL)
+PACK: dict[str, Callable[[bytes], bytes]] = {
+    "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress, "zst": lambda data: bytes(zstd_module().compress(data)),
+}  # fmt: skip
+FILES = {"ros1": "drive.bag", "mcap": "drive.mcap", "ros2": "drive.db3"}
+
+
+def written(folder: Path, format: str, scans: list[Any] = SCANS) -> Path:
+    """The file of a bag."""
+    target = folder / FILES[format]
+    if format != "ros2":
+        write_bag(target, scans)
+        return target
+    write_bag(folder / "folder", scans)
+    shutil.move(folder / "folder" / "folder.db3", target)
+    shutil.rmtree(folder / "folder")
+    return target
+
+
+def notes(log: Any) -> str:
+    return " ".join(log.notes)
+
+
+# Files
+
+
+@pytest.mark.parametrize("ending", PACK)
+@pytest.mark.parametrize("format", [*FILES, "carmen"])
+def test_packed_logs_are_read_whatever_their_name(tmp_path: Path, format: str, ending: str) -> None:
+    if format == "carmen":
+        file = tmp_path / "drive.log"
+        write_carmen(file, SCANS)
+    else:
+        file = written(tmp_path, format)
+    packed = tmp_path / "data"
+    packed.write_bytes(PACK[ending](file.read_bytes()))
+    log = read_log(packed)
+    assert log.format == format
+    assert len(log) == len(SCANS)
+    assert all(map(agree, log.scans, SCANS))
+
+
+@pytest.mark.parametrize("ending", PACK)
+def test_packed_lines_that_end_too_early_say_what_unpacks_the_rest(tmp_path: Path, ending: str) -> None:
+    write_carmen(tmp_path / "a.log", SCANS)
+    data = PACK[ending]((tmp_path / "a.log").read_bytes())
+    (tmp_path / "a.log").write_bytes(data[: len(data) // 2])
+    with pytest.raises(LogError, match=r"a\.log: expected whole data of .*, but after line \d+ .*cat FILE > PART"):
+        read_log(tmp_path / "a.log")
+
+
+@pytest.mark.parametrize("format", FILES)
+@pytest.mark.parametrize("share", [0.4, 0.8, 0.97])
+def test_of_a_bag_that_was_cut_the_whole_part_is_read_and_it_is_said(tmp_path: Path, format: str, share: float) -> None:
+    file = written(tmp_path, format, drive(200, SMALL))
+    data = file.read_bytes()
+    file.write_bytes(data[: int(len(data) * share)])
+    log = read_log(file)
+    assert (share - 0.35) * 200 < len(log) <= 200
+    assert f"{file} is cut, or was never closed" in notes(log)
+    assert "whole messages are read" in notes(log)
+
+
+@pytest.mark.parametrize("format", ["ros1", "mcap"])
+def test_a_chunk_that_was_packed_and_cut_is_read_up_to_the_cut(tmp_path: Path, format: str) -> None:
+    """Recorders pack many messages at once: the last such chunk is the one that is cut."""
+    from rosbags import rosbag1, rosbag2
+    from rosbags.interfaces import Connection
+
+    plain = written(tmp_path, format, drive(400))
+    target = tmp_path / f"packed{plain.suffix}"
+    if format == "ros1":
+        reader: Any = rosbag1.Reader(plain)
+        writer: Any = rosbag1.Writer(target)
+        writer.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
+    else:
+        reader, writer = rosbag2.Reader(plain), rosbag2.Writer(target, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+        writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
+
+    def added(connection: Connection) -> Any:
+        told = {"md5sum": connection.digest} if format == "ros1" else {"rihs01": connection.digest or "RIHS01_0"}
+        return writer.add_connection(connection.topic, connection.msgtype, msgdef=connection.msgdef.data, **told)
+
+    with reader, writer:
+        topics = {connection.id: added(connection) for connection in reader.connections}
+        for connection, time, raw in reader.messages():
+            writer.write(topics[connection.id], time, raw)
+    file = next(target.glob("*.mcap")) if target.is_dir() else target
+    data = file.read_bytes()
+    file.write_bytes(data[: int(0.7 * len(data))])
+    log = read_log(file)
+    assert 100 < len(log) < 400
+    assert "is cut" in notes(log)
+
+
+def parts(folder: Path, ending: str, count: int = 3) -> None:
+    """The parts of one drive; static transforms are in the first one alone. Part 10 comes last by its number, not by its name."""
+    folder.mkdir()
+    size = len(SCANS) // count
+    for k in range(count):
+        one = SCANS[k * size : (k + 1) * size] if k < count - 1 else SCANS[k * size :]
+        number = k if k < count - 1 else 10
+        if ending == ".db3":
+            write_bag(folder / "whole", one)
+            shutil.move(folder / "whole" / "whole.db3", folder / f"drive_{number}.db3")
+            shutil.rmtree(folder / "whole")
+        else:
+            write_bag(folder / f"drive_{number}{ending}", one)
+
+
+@pytest.mark.parametrize("metadata", [None, "rosbag2_bagfile_information: {version: 9, storage_identifier: ''}\n", "not: a bag\n", ""])
+@pytest.mark.parametrize("ending", [".db3", ".mcap", ".bag"])
+def test_parts_without_metadata_that_can_be_used_are_one_drive(tmp_path: Path, ending: str, metadata: str | None) -> None:
+    parts(tmp_path / "drive", ending)
+    if metadata is not None:
+        (tmp_path / "drive" / "metadata.yaml").write_text(metadata)
+    log = read_log(tmp_path / "drive")
+    assert len(log) == len(SCANS)
+    assert all(map(agree, log.scans, SCANS))
+    assert "3 parts are read as one drive, from drive_0" in notes(log)
+    assert "these parts are not there: 2, 3, 4, 5, 6, …" in notes(log)
+    assert ("metadata.yaml cannot be used" in notes(log)) == (metadata is not None)
+
+
+def test_one_part_that_is_named_alone_is_said_to_be_one(tmp_path: Path) -> None:
+    parts(tmp_path / "drive", ".db3")
+    log = read_log(tmp_path / "drive" / "drive_0.db3")
+    assert len(log) == len(SCANS) // 3
+    assert "drive_0.db3 is one part of a drive, and is read alone. Beside it lie drive_1.db3, drive_10.db3: name the folder" in notes(log)
+    (tmp_path / "drive" / "drive_1.db3").rename(tmp_path / "drive_1.db3")
+    assert "these parts are not there: 0" in notes(read_log(tmp_path / "drive_1.db3"))
+
+
+def test_a_part_that_is_damaged_or_packed_costs_no_other(tmp_path: Path) -> None:
+    parts(tmp_path / "drive", ".db3")
+    first, second, _ = sorted((tmp_path / "drive").iterdir())
+    (tmp_path / "drive" / "drive_0.db3.zstd").write_bytes(PACK["zst"](first.read_bytes()))
+    first.unlink()
+    second.write_bytes(b"")
+    log = read_log(tmp_path / "drive")
+    assert len(log) == len(SCANS) - len(SCANS) // 3
+    assert "A part was not read." in notes(log)
+    assert "drive_1.db3" in notes(log)
+
+
+def test_a_folder_of_several_drives_is_refused(tmp_path: Path) -> None:
+    for name in ("monday", "tuesday"):
+        write_bag(tmp_path / f"{name}.mcap", SCANS)
+    with pytest.raises(
+        LogError, match=r"expected the parts of one drive, .* got monday\.mcap, tuesday\.mcap; name one of the files, or ros2 bag reindex"
+    ):
+        read_log(tmp_path)
+
+
+def test_metadata_that_leaves_a_part_out_is_said(tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive", SCANS)
+    shutil.copy(tmp_path / "drive" / "drive.db3", tmp_path / "drive" / "drive_1.db3")
+    log = read_log(tmp_path / "drive")
+    assert len(log) == len(SCANS)
+    assert "names 1 of the 2 files beside it" in notes(log)
+
+
+# A full disk
+
+
+def full(*_: Any, **__: Any) -> Any:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_no_room_for_a_copy_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.mcap.gz").write_bytes(gzip.compress(written(tmp_path, "mcap").read_bytes()))
+    monkeypatch.setattr(shutil, "copyfileobj", full)
+    with pytest.raises(
+        LogError,
+        match=r"a\.mcap\.gz: expected room for a temporary copy in .*, got a full disk; free some, or name another folder \(TMPDIR",
+    ):
+        read_log(tmp_path / "a.mcap.gz")
+
+
+# Clocks
+
+TIMES = [0.5 * i for i in range(240)]
+
+
+def clocks(tmp_path: Path, scan: Callable[[float], float], odometer: Callable[[float], float], recorded: Callable[[float], float]) -> Any:
+    """What is read of a drive at one metre a second, where the clocks of the laser, the odometer and the recorder go as these say."""
+
+    def messages(m: Messages) -> list[tuple[str, float, Any]]:
+        both = [("/odom", t, m.odometry(100 + odometer(t), (t, 0.0, 0.0), base="laser")) for t in TIMES]
+        both += [("/scan", t + 0.01, m.scan(100 + scan(t))) for t in TIMES]
+        return [(topic, 100 + recorded(t), message) for topic, t, message in sorted(both, key=lambda one: one[1])]
+
+    log = read_log(bag(tmp_path / "bag", messages))
+    assert len(log) >= 0.99 * len(TIMES)
+    return log
+
+
+def true(t: float) -> float:
+    return t
+
+
+def off(log: Any) -> float:
+    """How far the odometry of most scans is off, at most: metres, and so seconds."""
+    return max(abs(scan.odometry[0] - (scan.line - 1) * 0.5) for scan in log.scans)
+
+
+HALF = TIMES[-1] / 2
+BROKEN: dict[str, Callable[[float], float]] = {
+    "10 s back from midway": lambda t: t - 10 * (t > HALF),
+    "10 s on from midway": lambda t: t + 10 * (t > HALF),
+    "2 s on from midway": lambda t: t + 2 * (t > HALF),
+    "2 % fast": lambda t: 1.02 * t,
+    "2 % slow": lambda t: 0.98 * t,
+    "all equal": lambda t: 0.0,
+    "0 from midway": lambda t: t if t < HALF else -100.0,
+    "0 up to midway": lambda t: t if t > HALF else -100.0,
+    "an hour on": lambda t: t + 3600,
+}
+
+
+@pytest.mark.parametrize("topic", ["scan", "odom"])
+@pytest.mark.parametrize("what", BROKEN)
+def test_clocks_that_part_are_found_and_the_times_of_recording_used(tmp_path: Path, what: str, topic: str) -> None:
+    broken = BROKEN[what]
+    log = clocks(tmp_path, *((broken, true) if topic == "scan" else (true, broken)), true)
+    assert off(log) < 0.1
+    assert "The times in the headers contradict themselves" in notes(log)
+    assert "The times of recording are used." in notes(log)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "said"),
+    [
+        (true, ""),
+        (lambda t: t + 0.3 * math.sin(t), ""),  # late by itself, now more and now less
+        (lambda t: t + 3600 + 0.05 * t, ""),  # another clock than that of both headers
+        (lambda t: 0.0, "were all recorded at one time"),
+        (lambda t: 10 * math.ceil(t / 10), "were recorded in 12 bursts, each of up to 9.5 s"),
+    ],
+)
+def test_times_of_recording_that_are_worse_are_not_used(tmp_path: Path, recorded: Callable[[float], float], said: str) -> None:
+    log = clocks(tmp_path, true, true, recorded)
+    assert off(log) < 0.1
+    assert said in notes(log)
+    assert ("The times in the headers are used." in notes(log)) == bool(said)
+
+
+def test_if_both_clocks_are_broken_it_is_said(tmp_path: Path) -> None:
+    log = clocks(tmp_path, BROKEN["10 s back from midway"], true, lambda t: 10 * math.ceil(t / 10))
+    assert "The times of recording are no better" in notes(log)
+
+
+# Lasers
+
+
+def two_lasers(m: Messages, *topics: str) -> list[tuple[str, float, Any]]:
+    """A laser that looks ahead and one that looks back, whose scans come by turns."""
+    found: list[tuple[str, float, Any]] = [
+        ("/tf_static", 0.5, m.transform("base_link", "front", (0.2, 0.0, 0.0))),
+        ("/tf_static", 0.5, m.transform("base_link", "rear", (-0.2, 0.0, math.pi))),
+    ]
+    for t in range(1, 9):
+        found.append(("/odom", t, m.odometry(t, (0.1 * t, 0.0, 0.0))))
+        found.append((topics[t % len(topics)], t, m.scan(t, "rear" if t % 2 else "front")))
+    return found
+
+
+def test_each_scan_is_mounted_as_its_own_frame_says(tmp_path: Path) -> None:
+    log = read_log(bag(tmp_path / "one", lambda m: two_lasers(m, "/scan")))
+    assert [round(scan.laser.mount[2], 3) for scan in log.scans] == [3.142, 0.0] * 4
+    assert "The scans are of several frames (4 of rear, 4 of front)" in notes(log)
+    path = bag(tmp_path / "two", lambda m: two_lasers(m, "/front", "/rear"))
+    with pytest.raises(LogError, match=r"name one with --scan-topic, once for each"):
+        read_log(path)
+    both = read_log(path, scan_topic=["/front", "rear"])
+    assert [scan.laser.mount for scan in both.scans] == [scan.laser.mount for scan in log.scans]
+    assert {scan.laser.mount[0] for scan in read_log(path, scan_topic="rear").scans} == {-0.2}
+
+
+@pytest.mark.parametrize("topic", ["/tf_static", "/tf"])
+def test_of_two_transforms_to_a_laser_the_later_one_is_used_and_it_is_said(tmp_path: Path, topic: str) -> None:
+    def messages(m: Messages) -> list[tuple[str, float, Any]]:
+        mounts: list[Pose] = [(0.2, 0.0, 0.0), (0.2, 0.0, 0.001), (0.2, 0.0, math.pi)]
+        return [
+            *[(topic, 0.5 + i / 10, m.transform("base_link", "laser", mount)) for i, mount in enumerate(mounts)],
+            *[("/odom", t, m.odometry(t, (t, 0.0, 0.0))) for t in (1.0, 2.0)],
+            ("/scan", 1.5, m.scan(1.5)),
+        ]
+
+    log = read_log(bag(tmp_path / "bag", messages))
+    assert abs(log.scans[0].laser.mount[2]) == pytest.approx(math.pi)
+    assert (
+        "The 3 transforms from base_link to laser, by which the laser is mounted, contradict each other by up to 0.00 m and 180 degrees"
+        in notes(log)
+    )
+
+
+def test_a_transform_that_is_repeated_contradicts_nothing(tmp_path: Path) -> None:
+    def messages(m: Messages) -> list[tuple[str, float, Any]]:
+        return [
+            *[("/tf", t, m.transform("base_link", "laser", (0.2, 0.0, 0.1), t)) for t in (1.0, 1.5, 2.0)],
+            *[("/odom", t, m.odometry(t, (t, 0.0, 0.0))) for t in (1.0, 2.0)],
+            ("/scan", 1.5, m.scan(1.5)),
+        ]
+
+    log = read_log(bag(tmp_path / "bag", messages))
+    assert log.notes == ("Scans are those of /scan, odometry that of /odom.",)
+
+
+def test_first_echoes_of_a_laser_with_several_are_read(tmp_path: Path) -> None:
+    def messages(m: Messages) -> list[tuple[str, float, Any]]:
+        scan = m.scan(1.5)
+        echo = m.types["sensor_msgs/msg/LaserEcho"]
+        beams = [[1.0, 3.0], [2.0], [], [4.0, 5.0], [9.0]]
+        scan = m.types["sensor_msgs/msg/MultiEchoLaserScan"](
+            header=scan.header, angle_min=-1.0, angle_max=1.0, angle_increment=0.5, time_increment=0.0, scan_time=0.1, range_min=0.1, range_max=8.0,
+            ranges=[echo(echoes=np.array(beam, dtype=np.float32)) for beam in beams], intensities=[],
+        )  # fmt: skip
+        return [*[("/odom", t, m.odometry(t, (t, 0.0, 0.0))) for t in (1.0, 2.0)], ("/echoes", 1.5, scan)]
+
+    log = read_log(bag(tmp_path / "bag", messages))
+    assert log.scans[0].ranges.tolist() == [1, 2, math.inf, 4, math.inf]
+
+
+# Odometry of several sources
+
+
+def alternate(m: Messages, kind: str) -> list[tuple[str, float, Any]]:
+    """A robot that drives along x; another program puts it elsewhere."""
+    found: list[tuple[str, float, Any]] = []
+    for i in range(100):
+        t = 1.0 + 0.1 * i
+        here, there = (0.1 * i, 0.0, 0.0), (5.0 + 0.09 * i, 3.0, 1.0)
+        if kind == "topic":
+            found += [("/odom", t, m.odometry(t, here, "laser"))]
+            found += [("/odom", t + 0.05, m.odometry(t + 0.05, there, "laser"))] * (i % 3 < 2)
+        elif kind == "frames":
+            found += [("/odom", t, m.odometry(t, here, "laser")), ("/odom", t, m.odometry(t, there, "camera"))][:: 1 if i % 2 else -1]
+            found += [("/odom", t + 0.05, m.odometry(t + 0.05, (0.1 * i + 0.05, 0.0, 0.0), "laser"))]
+        elif kind == "transforms":
+            found += [("/tf", t, m.transform("odom", "laser", here, t))]
+            found += [("/tf", t + 0.05, m.transform("odom", "laser", there, t + 0.05))] * (i % 3 < 2)
+        else:
+            found += [("/tf", t, m.transform("odom", "laser", here, t)), ("/tf", t, m.transform("world", "laser", there, t))]
+        found.append(("/scan", t + 0.02, m.scan(t)))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("topic", "Several sources publish /odom, whose poses alternate, up to 5.8 m apart: 100 and 67 of 167 messages"),
+        ("frames", "Several sources publish /odom: 100 from odom to camera, 200 from odom to laser. Those from odom to laser are read"),
+        ("transforms", "Several sources publish the transforms from odom to laser, whose poses alternate, up to 5.8 m apart"),
+        ("parents", ""),
+    ],
+)
+def test_odometry_of_several_sources_is_that_of_one_and_it_is_said(tmp_path: Path, kind: str, said: str) -> None:
+    log = read_log(bag(tmp_path / "bag", lambda m: alternate(m, kind)))
+    assert max(abs(scan.odometry[0] - 0.1 * i) + abs(scan.odometry[1]) for i, scan in enumerate(log.scans)) < 0.01
+    assert said in notes(log)
+
+
+def test_import_takes_several_topics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = bag(tmp_path / "two", lambda m: two_lasers(m, "/front", "/rear"))
+    assert main(["import", str(path), "--scan-topic", "/front", "--scan-topic", "/none", "-o", str(tmp_path / "t")]) == 1
+    assert "expected a topic of LaserScan, got '/none'" in capsys.readouterr().err
+    assert main(["import", str(path), "--scan-topic", "/front", "--scan-topic", "/rear", "-o", str(tmp_path / "t")]) == 1
+    assert "expected a robot that drives, got a way of 0.7 m" in capsys.readouterr().err
