@@ -60,7 +60,7 @@ class LogMap:
     rungs     what each kind of evidence is worth; empty where that was not asked
     seconds   processor time of each stage, from the track on
     limit     seconds that there were for the minimal maps
-    notes     what is to be said of how it was mapped
+    notes     what is to be said of its track and of how it was mapped
     interrupted  whether somebody ended the run before it was through
     """
 
@@ -186,7 +186,7 @@ def map_log(
     chosen = (theory or theory_for(imported)).replace(**choices or {})
     left = seconds_left(log, imported)
     allowed = max(left * (1 - LADDER if with_ladder else 1), LEAST) if limit is None else limit
-    notes: tuple[str, ...] = ()
+    notes = imported.notes
     climbed: list[Rung] = []
 
     def outcome(solution: Solution, interrupted: bool = True) -> LogMap:
@@ -199,7 +199,7 @@ def map_log(
     if solution.status is Status.UNSATISFIABLE and theory is None and not {"star", "boundary", "level"} & set(choices or ()):
         bare = BARE.replace(**choices or {})
         if bare != chosen:
-            chosen, notes = bare, (NO_STARS,)
+            chosen, notes = bare, (*notes, NO_STARS)
             solution = mapping.solve(imported.trace, chosen, limit=allowed, maps=maps)
     mapping.known = lambda: outcome(solution)
     seconds["maps"] = round(time.process_time() - begin, 3)

@@ -161,7 +161,7 @@ def test_flags_are_laid_over_the_theory_that_suits_the_walls(
         raise SSHError(f"star={theory.star}, boundary={theory.boundary}")
 
     monkeypatch.setattr(
-        log_maps, "import_log", lambda *_: SimpleNamespace(trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={})
+        log_maps, "import_log", lambda *_: SimpleNamespace(trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={}, notes=())
     )
     monkeypatch.setattr(log_maps.LogMapping, "solve", solve)
     small = hall.with_name("first.log")
@@ -203,7 +203,7 @@ def test_a_log_whose_stars_no_map_fits_is_mapped_without(monkeypatch: pytest.Mon
     trace = replace(
         Trace.from_steps("aba", ["travel", "around"], stars=[(1, 0, 0, 0), (0, 0, 1, 0), (0, 1, 0, 0)]), extra={"right_angles": True}
     )
-    imported = SimpleNamespace(trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={})
+    imported = SimpleNamespace(trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={}, notes=())
     monkeypatch.setattr(log_maps, "import_log", lambda *_: imported)
     log = RobotLog((Scan(np.ones(3), Laser(-1.0, 1.0, 3, 30.0), (0.0, 0.0, 0.0)),), source="x")
     done, asked = map_log(log, with_ladder=False), map_log(log, choices={"star": "frame"}, with_ladder=False)

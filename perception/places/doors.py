@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,7 +52,15 @@ class Door:
 
 
 def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
-    """The doors that the robot drove through, in order. One that it drove through twice is there twice."""
+    """The doors that the robot drove through, in order. One that it drove through twice is there twice. Where the track is broken, each part is a way of its own."""
+    return tuple(
+        replace(door, scan=min(door.scan + begin, end - (end < len(log))), way=door.way + float(track.way[begin]))
+        for begin, end in track.spans
+        for door in _doors_of_span(replace(log, scans=log.scans[begin:end]), track.part(begin, end))
+    )
+
+
+def _doors_of_span(log: RobotLog, track: Track) -> tuple[Door, ...]:
     maps = LocalMaps(log.scans, track, 2 * ASIDE)
     ways = np.arange(0.0, track.way[-1], STRIDE)
     # While the robot stands, its way does not grow: only the first of such scans is a point to interpolate between.
@@ -102,6 +110,11 @@ def are_frequent(doors: Sequence[Door], track: Track) -> bool:
 
 def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
     """The visits to doors, in order: one where the robot went into a room and came back by the same door. Corrected poses are not read."""
+    spans = [[door for door in doors if begin <= min(door.scan, len(track.poses) - 1) < end] for begin, end in track.spans]
+    return tuple(visit for some in spans for visit in _visits_of_span(track, some))
+
+
+def _visits_of_span(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
     passes: list[list[Door]] = []
     for door in doors:
         if passes and math.dist(door.middle, passes[-1][-1].middle) < SAME:

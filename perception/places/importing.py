@@ -6,19 +6,21 @@ the middle of the place: the plan of Kuipers & Beeson (2002) to do without physi
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from perception.errors import ImageWarning, LogError
+from perception.places import jumps
 from perception.places.doors import are_frequent, find_doors, is_wide, visits_of
 from perception.places.scale import Scale, suggested
 from perception.places.tracing import to_trace
-from perception.places.track import Track, follow
+from perception.places.track import Track, follow, turned_wrongly
 from perception.places.visits import Visit, find_visits
 from perception.readers.scans import RobotLog
 from perception.reciprocal import ReciprocalTransformer
@@ -28,6 +30,10 @@ from ssh_abduction.trace import Trace
 
 # A view is to be seen so many times in the mean, at least: of few images of many places most views would be seen once, and tell nothing.
 SEEN = 12
+# A track that is broken before more than such a share of the scans is none.
+MOST_BREAKS = 0.1
+# Units by how many there are in a metre. The way by odometry is compared with that by scans in so many scans, from which it may be off by such a share.
+UNITS, STRETCH, UNLIKE = {"millimetres": 1000.0, "centimetres": 100.0}, 80, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +45,7 @@ class Imported:
     scale    what the building was measured by
     visits   the distinctive places that the robot passed
     seconds  processor time of each stage
+    notes    what makes the track suspicious, in sentences
     """
 
     trace: Trace
@@ -46,6 +53,7 @@ class Imported:
     scale: Scale
     visits: tuple[Visit, ...]
     seconds: Mapping[str, float]
+    notes: tuple[str, ...] = ()
 
 
 def import_log(
@@ -68,9 +76,15 @@ def import_log(
             f"{named(log.source)}: expected scans that meet walls, got {len(log)} in which no beam meets anything; look at the laser"
         )
     with _timed(seconds, "track"):
-        track = follow(log)
+        log, track, notes = tracked(log)
+    if len(track.breaks) > MOST_BREAKS * len(log):
+        raise LogError(
+            f"{named(log.source)}: expected a log of one drive, got {len(log)} scans of which {len(track.breaks)} show nothing of what the one before them shows; sort it by time, or cut it into drives{_besides(notes)}"
+        )
     if track.way[-1] < 1.0:
-        raise LogError(f"{named(log.source)}: expected a robot that drives, got a way of {track.way[-1]:.1f} m; take a longer log")
+        raise LogError(
+            f"{named(log.source)}: expected a robot that drives, got a way of {track.way[-1]:.1f} m; take a longer log{_besides(notes)}"
+        )
     with _timed(seconds, "scale"):
         found = suggested(log.scans, track)
         scale = replace(found, gateway=found.gateway if gateway is None else gateway, radius=found.radius if radius is None else radius)
@@ -80,18 +94,58 @@ def import_log(
         visits = visits_of(track, passed) if scale.doors else find_visits(log, track, scale)
     if not visits and scale.doors:
         raise LogError(
-            f"{named(log.source)}: expected a way through doors, got {track.way[-1]:.0f} m without any; look for junctions instead (--places junctions)"
+            f"{named(log.source)}: expected a way through doors, got {track.way[-1]:.0f} m without any; look for junctions instead (--places junctions){_besides(notes)}"
         )
     if not visits:
         raise LogError(
             f"{named(log.source)}: expected a way past junctions, corners or dead ends, got {track.way[-1]:.0f} m without any at a radius of "
-            f"{scale.radius:g} m; take a longer log, or a smaller radius (--radius)"
+            f"{scale.radius:g} m; take a longer log, or a smaller radius (--radius){_besides(notes)}"
         )
     with _timed(seconds, "trace"):
         trace = to_trace(log, track, scale, visits, name)
     with _timed(seconds, "views"):
         trace = with_views(trace)
-    return Imported(trace, track, scale, visits, seconds)
+    return Imported(trace, track, scale, visits, seconds, notes)
+
+
+def tracked(log: RobotLog) -> tuple[RobotLog, Track, tuple[str, ...]]:
+    """The log with odometry of one source in metres, its track, and what makes that suspicious."""
+    log, alternating = jumps.of_one_source(log)
+    log, counted = in_metres(log)
+    track = follow(log)
+    return log, track, (*alternating, *counted, *jumps.said_of(log, track, turned_wrongly(log, track)))
+
+
+def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:
+    """The log in metres, where its odometry counts a smaller unit, and what is to be said of that.
+
+    The unit is that in which a stretch of the way is most like the way by scans. Where it is like it in none, the log stays as it is.
+    """
+    usual = jumps.usual_step(log)
+    if usual <= jumps.LONG:
+        return log, []
+    far = np.array([scan.odometry[:2] for scan in log.scans])
+    begin = int(np.argmax(np.hypot(*np.diff(far, axis=0).T) > usual / 2))
+    stretch = replace(log, scans=log.scans[begin : begin + STRETCH])
+
+    def off(unit: str) -> float:
+        tried = jumps.in_unit(stretch, UNITS[unit])
+        told, seen = np.array([scan.odometry[:2] for scan in tried.scans]), follow(tried)
+        ways = [np.hypot(*np.diff(way, axis=0).T) for way in (told, seen.poses[:, :2])]
+        return float(np.abs(ways[0] - ways[1]).sum() / max(ways[1].sum(), 1e-9)) if not seen.breaks else math.inf
+
+    found = min(UNITS, key=off)
+    if off(found) > UNLIKE:
+        return log, []
+    count = UNITS[found]
+    return jumps.in_unit(log, count), [
+        f"The odometry does not count metres: its usual step between two scans would be {usual:.0f} m. It is read as {found}, as then it is like the way by scans, {usual / count:.2f} m a step."
+    ]
+
+
+def _besides(notes: Sequence[str]) -> str:
+    """Notes as the end of an error."""
+    return f". {' '.join(notes)}" if notes else ""
 
 
 def with_views(trace: Trace) -> Trace:

@@ -102,8 +102,9 @@ class LocalMaps:
     def around(self, scan: int, middle: Array | Sequence[float], half: float) -> Patch:
         """The square patch of 2 x half metres around a position near a scan, as the scans of its window saw it."""
         way = self._track.way
-        begin = int(np.searchsorted(way, way[scan] - self._reach))
-        end = int(np.searchsorted(way, way[scan] + self._reach, side="right"))
+        first_scan, last_scan = self._track.span_of(scan)  # what was seen elsewhere says nothing here
+        begin = max(int(np.searchsorted(way, way[scan] - self._reach)), first_scan)
+        end = min(int(np.searchsorted(way, way[scan] + self._reach, side="right")), last_scan)
         self._move(begin, end)
         first = np.rint(np.asarray(middle) / CELL).astype(int) - round(half / CELL)
         rows, columns = (np.arange(n, n + 2 * round(half / CELL) + 1) % self._side for n in first)

@@ -74,7 +74,8 @@ def to_trace(log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit],
             steps.append(_step(log, track, visit, pose, patch, last, stride, number))
             last = (visit, pose)
         if steps and number < len(visits) - 1:
-            steps[-1] = replace(steps[-1], action=Action.of("travel"))
+            carried = track.span_of(visit.scan) != track.span_of(visits[number + 1].scan)
+            steps[-1] = replace(steps[-1], action=Action.that_slipped(len(steps) - 1) if carried else Action.of("travel"))
     steps = _with_turns(steps, stride, visits)
     return Trace(
         tuple(steps),
@@ -97,13 +98,16 @@ def _step(
     number: int,
 ) -> Step:
     onward = covariance = None
-    if last is not None:
+    cuts = [] if last is None else track.cuts_between(last[0].scan, visit.scan)
+    if last is not None and not cuts:
         onward = between(last[1], pose)
         covariance = _covariance(track, last[0].scan, visit.scan, last[1], pose)
     scan = log.scans[visit.scan]
     extra: dict[str, object] = {"scan": visit.scan, "visit": number}
     if scan.time is not None:
         extra["time"] = scan.time
+    if cuts:  # why there is no displacement
+        extra["cuts"] = cuts
     truth = None
     seen = between(_pose(track, visit.scan), pose)
     extra["seen"] = [round(x, 4) for x in seen]

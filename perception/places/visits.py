@@ -71,6 +71,10 @@ class Visit:
     straight: float = 0.0
     support: float = 1.0
 
+    def later(self, scans: int) -> Visit:
+        """The same visit, so many scans later."""
+        return replace(self, scan=self.scan + scans, begin=self.begin + scans, end=self.end + scans)
+
 
 @dataclass(frozen=True, eq=False)
 class _Vote:
@@ -79,7 +83,15 @@ class _Vote:
 
 
 def find_visits(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
-    """The visits of a log, in the order of the way. Corrected poses are not read."""
+    """The visits of a log, in the order of the way. Where the track is broken, each part is a way of its own. Corrected poses are not read."""
+    return tuple(
+        visit.later(begin)
+        for begin, end in track.spans
+        for visit in _visits_of_span(replace(log, scans=log.scans[begin:end]), track.part(begin, end), scale)
+    )
+
+
+def _visits_of_span(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
     maps = LocalMaps(log.scans, track, scale.window)
     asked = milestones(track, EVERY)
     votes = [vote for i in asked if (vote := _vote(maps, track, scale, i)) is not None]

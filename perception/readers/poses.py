@@ -157,7 +157,8 @@ def sources_of(track: Track) -> list[NDArray[np.intp]]:
     if len(poses) < 10:
         return [np.arange(len(poses))]
     over = np.abs(poses[2:] - poses[:-2])
-    near = 0.05 + 3 * float(np.median(np.hypot(over[:, 0], over[:, 1])))
+    # A quarter of these steps at least is within one source, even where two come at random.
+    near = 0.05 + 4 * float(np.percentile(np.hypot(over[:, 0], over[:, 1]), 25))
     heads: list[list[float]] = []
     of: list[int] = []
     for pose in poses.tolist():

@@ -88,6 +88,7 @@ def run(options: argparse.Namespace) -> int:
     log = read(options.log, options)
     warn([*log.notes, *damage(log)])
     done = import_log(log, options.gateway, options.radius, named_after(options.log), doors)
+    warn(done.notes)
     scale = done.scale
     places = "doors" if scale.doors else f"distinctive places at a radius of {scale.radius:g} m, gateways from {scale.gateway:g} m"
     said = f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: {counted(len(done.visits), 'visits')} to {places}; {counted(len(done.trace), 'steps')}"

@@ -1,0 +1,241 @@
+"""Odometers that jump: where they do, in which unit they count, and what is to be said of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.readers.poses import Track as Odometry
+from perception.readers.poses import sources_of
+from perception.readers.scans import Pose, RobotLog, Scan
+from ssh_abduction.odometry import between
+
+if TYPE_CHECKING:
+    from perception.places.track import Track
+
+# A step between two scans is impossible beyond so many metres and so many times the usual step, and doubtful beyond half of each.
+FAR, UNUSUAL = 1.5, 3.5
+# Where no scan was logged for so many times the usual time, the robot may have driven on, at so many times its usual speed.
+PAUSE, FASTER = 3.0, 2.0
+# A usual step between two scans of more than so many metres is none.
+LONG = 5.0
+# The odometer says the same pose up to this, in metres and radians. Of the beams of a robot that stands still, less than such a share changes, by more than so many metres and such a share of them.
+STILL, MOVED, CHANGED, CHANGED_SHARE = 1e-3, 0.35, 0.2, 0.03
+# The same share where no scan was logged meanwhile, as then the robot may be far away, in a corridor that looks alike.
+MOVED_UNSEEN = 0.15
+# An odometer that stands still in more than such a share of the steps is missing.
+MISSING = 0.5
+# The way over every second scan is about as long as the way, unless poses go to and fro: then it is shorter than such a share.
+TO_AND_FRO = 0.8
+# A log is not in order if the times of more than such a share of its scans run back.
+SHUFFLED = 0.05
+# Beams see no farther than so many metres here.
+NO_RANGE = 25.0
+# A step to so near the origin, in metres, is that of an odometer that starts anew.
+ANEW = 1.0
+
+
+def of_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
+    """The log with the odometry of one source, where the poses of several alternate, and what is to be said of that."""
+    odometry = Odometry()
+    for number, scan in enumerate(log.scans):
+        odometry.add(number, number, scan.odometry)
+    sources = sources_of(odometry)
+    if len(sources) == 1:
+        return log, []
+    said = (
+        f"The poses of several sources alternate in the odometry, {len(sources[0])} and {len(sources[1])} of {len(log)}: those of the first are used. "
+        "Stop the other source, and record again, if it is the better one."
+    )
+    return replace(log, scans=_of_source(log.scans, sources[0])), [said]
+
+
+def usual_step(log: RobotLog) -> float:
+    """The usual step between two scans, by the odometer: the median of those that are no standing still. 0 where there are none."""
+    far = _far(log, 1)
+    return float(np.median(far[far > 0])) if (far > 0).any() else 0.0
+
+
+def in_unit(log: RobotLog, count: float) -> RobotLog:
+    """The log in metres, where its odometry counts something of which there are so many in a metre."""
+    return replace(
+        log,
+        scans=tuple(replace(scan, odometry=(scan.odometry[0] / count, scan.odometry[1] / count, scan.odometry[2])) for scan in log.scans),
+    )
+
+
+def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan, ...]:
+    """The scans with the odometry of some of them, between which it is interpolated, and beyond which it goes on."""
+    from scipy.interpolate import interp1d
+
+    poses = np.array([scans[number].odometry for number in members])
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    rows = interp1d(members, poses, axis=0, fill_value="extrapolate")(np.arange(len(scans)))
+    odometry: list[Pose] = [(x, y, math.remainder(heading, math.tau)) for x, y, heading in rows.tolist()]
+    return tuple(replace(scan, odometry=pose) for scan, pose in zip(scans, odometry, strict=True))
+
+
+def said_of(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> list[str]:
+    """What is to be said of where a track is cut or broken, and of times that run back.
+
+    Args:
+        log: The log that was followed.
+        track: Its track.
+        turned: The scans at which the robot turned otherwise than the odometer says, and by how many radians.
+    """
+    steps = {cut: between(log.scans[cut - 1].odometry, log.scans[cut].odometry) for cut in track.cuts}
+    far = {cut: math.hypot(x, y) for cut, (x, y, _) in steps.items()}
+    jumps = [cut for cut in track.cuts if far[cut] > STILL]
+    still = [cut for cut in track.cuts if far[cut] <= STILL and cut not in track.breaks]
+    notes = []
+    if jumps:
+        first, most = jumps[0], max(jumps, key=far.__getitem__)
+        anew = ", where it starts anew from 0" if math.hypot(*log.scans[first].odometry[:2]) < ANEW else ""
+        notes.append(
+            f"The odometry jumps {_times(len(jumps))} in {len(log)} scans: by {far[first]:.1f} m before scan {first} ({_where(log, first)}){anew}"
+            + (f", and by {far[most]:.1f} m at most" if len(jumps) > 1 else "")
+            + ". Nothing is known of how the robot moved there, so the trace has no displacement across. An odometer that is started anew, or a second program that "
+            "publishes the same odometry, jumps like this."
+        )
+    if still:
+        notes.append(
+            f"The odometry stands still in {len(still)} steps, from scan {still[0]} ({_where(log, still[0])}) on, while the scans show that the robot moved: it was carried, or the odometer "
+            "hung. The trace has no displacement across."
+        )
+    if track.breaks:
+        notes.append(
+            f"The scans show nothing of what was seen before, {_times(len(track.breaks))}: from scan {track.breaks[0]} ({_where(log, track.breaks[0])}) on. The robot may have been carried "
+            "there, so that what comes after is mapped as a way of its own."
+        )
+    if turned:
+        first, angle = turned[0]
+        notes.append(
+            f"Scans turn otherwise than the odometry, {_times(len(turned))}: at scan {first} ({_where(log, first)}) by {abs(math.degrees(angle)):.0f} degrees. The scans are believed."
+        )
+    far_apart, to_and_fro = usual_step(log), float(_far(log, 2).sum() / max(2 * _far(log, 1).sum(), 1e-9))
+    if far_apart > LONG:
+        notes.append(
+            f"The usual step between two scans is {far_apart:.0f} m by the odometry: it does not count metres, or the log is not in order."
+        )
+    elif to_and_fro < TO_AND_FRO and far_apart > 0:
+        notes.append(
+            f"The odometry goes to and fro: over every second scan its way is {100 * to_and_fro:.0f} % of that over every scan. Two programs may publish it, or the log is not in order."
+        )
+    missing = stands_still(log) if len(log) > 1 else np.zeros(1, bool)
+    if missing.mean() > MISSING:
+        notes.append(
+            f"The odometry stands still in {missing.sum()} of {len(missing)} steps. If the robot did not, its odometry is missing there, and the map rests on the scans alone."
+        )
+    times = np.array([scan.time for scan in log.scans if scan.time is not None])
+    back = int((np.diff(times) < 0).sum())
+    if back > SHUFFLED * len(log):
+        notes.append(f"The times of the scans run back {back} times in {len(log)} scans. If the log is not in the order of time, sort it.")
+    return notes
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
+def _where(log: RobotLog, number: int) -> str:
+    """Where a scan is in its log."""
+    scan = log.scans[number]
+    time = "" if scan.time is None else f", {scan.time:.1f} s"
+    return f"line or message {scan.line}{time}"
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """The scans to which steps lead of which the odometer knows nothing.
+
+    unknown   it jumps, or stands still while the robot was moved
+    carried   those of them to which the robot was carried while nobody logged
+    doubtful  other long steps, which are jumps if scans do not match there, but match where the robot was
+    """
+
+    unknown: frozenset[int] = frozenset()
+    carried: frozenset[int] = frozenset()
+    doubtful: frozenset[int] = frozenset()
+
+
+def unknown_steps(log: RobotLog) -> Unknown:
+    """Where the odometer jumps, by itself, and where it stands still although what the laser sees changes."""
+    if len(log) < 3:
+        return Unknown()
+    seconds = _seconds(log)
+    paused = np.zeros(len(log) - 1, bool) if seconds is None else seconds > PAUSE * np.median(seconds)
+    jumped, doubtful = _impossible(log, seconds, paused)
+    moved = _moved_while_still(log, paused)
+    return Unknown(_after(jumped) | moved, moved & _after(paused), _after(doubtful & ~jumped))
+
+
+def _after(steps: NDArray[np.bool_]) -> frozenset[int]:
+    """The scans to which steps lead."""
+    return frozenset((np.flatnonzero(steps) + 1).tolist())
+
+
+def _impossible(
+    log: RobotLog, seconds: NDArray[np.float64] | None, paused: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """The steps that are impossible, by metres, by many times the usual step, and too fast for the time since the scan before; and those that are doubtful."""
+    far, over_two = _far(log, 1), _far(log, 2)
+    if not far.any():
+        return np.zeros(len(far), bool), np.zeros(len(far), bool)
+    # Where poses alternate, each step is a jump, but those over two steps are not.
+    usual = min(float(np.median(steps[steps > 0])) for steps in (far, over_two) if (steps > 0).any())
+    least = max(FAR, UNUSUAL * usual)
+    jumped, doubtful = far > least, far > least / 2
+    if seconds is not None and paused.any():
+        timed = (seconds > 0) & ~jumped
+        fastest = float(np.percentile(far[timed] / seconds[timed], 95)) if timed.any() else 0.0
+        driven = paused & (far <= FASTER * fastest * seconds)
+        jumped, doubtful = jumped & ~driven, doubtful & ~driven
+    return jumped, doubtful
+
+
+def _moved_while_still(log: RobotLog, paused: NDArray[np.bool_]) -> frozenset[int]:
+    """The scans up to which the odometer stood still while what the laser sees changed; none where it mostly stands still, as then there is no odometer."""
+    still = stands_still(log)
+    if still.mean() > MISSING:
+        return frozenset()
+    found: set[int] = set()
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still, [0]])))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if any(_change(log.scans[begin], log.scans[k]) > MOVED for k in range(begin + 1, end + 1)):
+            found |= set(range(begin + 1, end + 1))
+        found |= {k for k in range(begin + 1, end + 1) if paused[k - 1] and _change(log.scans[k - 1], log.scans[k]) > MOVED_UNSEEN}
+    return frozenset(found)
+
+
+def stands_still(log: RobotLog) -> NDArray[np.bool_]:
+    """The steps in which the odometer says exactly the same pose, (n - 1,)."""
+    poses = np.array([scan.odometry for scan in log.scans])
+    return np.asarray(np.abs(np.diff(poses, axis=0)).max(axis=1) < STILL)
+
+
+def _change(first: Scan, last: Scan) -> float:
+    """The share of the beams whose ranges changed from one scan to another, of those that met something in either; 0 for scans of two lasers."""
+    if first.laser != last.laser:
+        return 0.0
+    before, after = (np.minimum(np.nan_to_num(scan.ranges, nan=0.0, posinf=NO_RANGE), NO_RANGE) for scan in (first, last))
+    told = ((before < NO_RANGE) | (after < NO_RANGE)) & (before > 0) & (after > 0)
+    changed = np.abs(before - after) > CHANGED + CHANGED_SHARE * np.minimum(before, after)
+    return float(changed[told].mean()) if told.any() else 0.0
+
+
+def _far(log: RobotLog, steps: int) -> NDArray[np.float64]:
+    """Metres by the odometer from each scan to the one so many scans later."""
+    positions = np.array([scan.odometry[:2] for scan in log.scans])
+    return np.asarray(np.hypot(*(positions[steps:] - positions[:-steps]).T))
+
+
+def _seconds(log: RobotLog) -> NDArray[np.float64] | None:
+    """Seconds from each scan to the next; None where the times are missing, or do not go on."""
+    if any(scan.time is None for scan in log.scans):
+        return None
+    seconds = np.diff(np.array([scan.time for scan in log.scans], dtype=float))
+    return seconds if (seconds >= 0).all() and seconds.any() else None
