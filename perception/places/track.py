@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from bisect import bisect
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -49,8 +49,12 @@ NEARBY = 1.0
 UNKNOWN = (0.5, 0.5, 0.5)
 # An odometer has turned wrongly if a scan that matches well says otherwise by more than this, in radians.
 TURNED = math.radians(60)
+# A robot that stands, by its odometer, was carried if scans moved by more than so many metres.
+CARRIED = 1.0
 # Without odometry a scan has to match better: at least such a share of its points lies on walls.
 SURE = 0.7
+# In a bare corridor, to go on and to stay match alike, up to such a share: then the robot went on.
+ALIKE = 0.03
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,16 @@ def follow(log: RobotLog, trust: Trust | None = None) -> Track:
     steps = unknown_steps(log)
     follower = _Follower(log, trust or Trust(), steps)
     track = follower.followed(steps.carried)
+    # Where people pass, or an arm of the robot moves, what the laser sees changes though the robot stands.
+    standing = frozenset(
+        k
+        for first, last in steps.still
+        for k in range(first, last + 1)
+        if np.hypot(*(track.poses[first : last + 1, :2] - track.poses[first - 1, :2]).T).max() <= CARRIED
+    )
+    if standing:
+        follower = replace(follower, steps=steps.but_for(standing))
+        track = follower.followed(steps.carried)
     if more := frozenset(_carried(log, track)):
         track = follower.followed(steps.carried | more)
     return track
@@ -188,8 +202,8 @@ def _bridged(
 ) -> tuple[Pose, Array, float] | None:
     """The pose of a scan by walls alone, with the covariance of the increment and the share of points on walls: near where the robot was, or where it went on as before. None where it matches nowhere."""
     wide = np.diag(UNKNOWN) ** 2
-    found = [_matched(points, normals, recent, last, guess, wide) for guess in (before, (0.0, 0.0, 0.0))]
-    best = max(found, key=lambda match: match[2])
+    onward, stayed = (_matched(points, normals, recent, last, guess, wide) for guess in (before, (0.0, 0.0, 0.0)))
+    best = stayed if stayed[2] > onward[2] + ALIKE else onward
     return best if best[2] >= SURE else None
 
 
