@@ -202,6 +202,22 @@ def test_no_room_for_a_copy_is_one_clear_error(tmp_path: Path, monkeypatch: pyte
         read_log(tmp_path / "a.mcap.gz")
 
 
+@pytest.mark.parametrize("name", ["drive", "drive.mcap", "drive.bag"])
+def test_a_bag_on_a_full_disk_is_one_clear_error_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    from rosbags import rosbag1, rosbag2
+
+    def no_room(*_: Any) -> None:
+        import apsw
+
+        raise apsw.FullError("database or disk is full") if name == "drive" else OSError(errno.ENOSPC, "No space left on device")
+
+    for writer in (rosbag1.Writer, rosbag2.Writer):
+        monkeypatch.setattr(writer, "write", no_room)
+    with pytest.raises(LogError, match=rf"{name}: expected a bag that can be written: .*(full|No space)"):
+        write_bag(tmp_path / name, SCANS)
+    assert not list(tmp_path.iterdir())
+
+
 # Clocks
 
 TIMES = [0.5 * i for i in range(240)]

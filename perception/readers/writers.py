@@ -87,8 +87,12 @@ def write_bag(path: str | os.PathLike[str], scans: Iterable[Scan], covariances: 
                     f"{named(path)}: expected the name of a folder, got that of a file; name another, or end it in .bag or .mcap"
                 )
             shutil.move(written, target)
+    except LogError:
+        raise
     except OSError as error:
         raise LogError(f"{named(path)}: expected a bag that can be written: {error.strerror or error}; check the path") from None
+    except Exception as error:  # whatever SQLite, which rosbags writes with, runs into
+        raise LogError(f"{named(path)}: expected a bag that can be written: {error}; check the disk and the path") from None
 
 
 def _numbered(scans: Iterable[Scan]) -> tuple[list[Scan], list[float]]:
