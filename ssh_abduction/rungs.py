@@ -138,7 +138,7 @@ def ladder(
     if known is not None:
         an_instance("known", known, Solution, MapError, mend="give what solve returned for this trace, or leave it out")
     if under_way is not None:
-        an_instance("under_way", under_way, UnderWay, SolverError)
+        an_instance("under_way", under_way, UnderWay, SolverError, mend="give an UnderWay, or leave it out")
     return _solved(trace, theory, limit, maps, stars, known, under_way or UnderWay())
 
 
