@@ -29,6 +29,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.sparse.linalg import lsqr, splu
 from scipy.special import gammaincc
 
+from ssh_abduction.clock import look_at_clock
 from ssh_abduction.maps import Fit, Pose, SSHMap
 from ssh_abduction.odometry import Odometry
 from ssh_abduction.theory.loops import turned
@@ -132,6 +133,7 @@ class _Problem:
         inverse = np.linalg.inv(self._misfit(onward) + HELD * np.identity(size))
         rotation: NDArray[np.complex128] = np.exp(1j * np.random.default_rng(0).uniform(-math.pi, math.pi, size))
         for _ in range(SWEEPS):
+            look_at_clock()
             rotation = inverse @ rotation
             rotation /= np.maximum(abs(rotation), 1e-300)
         angles: Array = np.angle(rotation)
@@ -183,6 +185,7 @@ class _Problem:
         return np.stack([(1 + scale) * ahead, (1 + scale) * left, rotated], axis=1), cos, sin
 
     def _residuals(self, unknown: Array) -> Array:
+        look_at_clock()
         predicted = self._predicted(unknown)[0]
         off = predicted - self._moved
         off[:, 2] -= math.tau * np.round(off[:, 2] / math.tau)
@@ -278,6 +281,7 @@ class _Problem:
         number = {int(k): i for i, k in enumerate(free)}
         covariance = np.zeros((self._positions, 2, 2))
         for place in range(self._positions):
+            look_at_clock()
             if 2 * place not in number:
                 continue
             columns = np.zeros((len(free), 2))

@@ -50,6 +50,7 @@ _LOGS = {
 _STEP_FIELDS = ("view", "image", "action", "star", "displacement", "covariance", "truth", "confidence")
 _ACTION_FIELDS = ("name", "kind", "turn", "gateway", "bearing")
 _QUARTERS = (None, "right", "around", "left")
+_USUAL = Odometry()  # what odometry is worth where the trace does not say
 
 
 @dataclass(frozen=True, slots=True)
@@ -379,7 +380,7 @@ class Trace:
         here = self.steps[a_whole_number("step", step, RangeError, 0, len(self) - 1)]
         if here.displacement is None or here.covariance is not None:
             return here.covariance
-        return (self.odometry or Odometry()).covariance(here.displacement)
+        return (self.odometry or _USUAL).covariance(here.displacement)
 
     def at(self, step: int) -> str:
         """Where a step is, as an error message says it: file and line, or the number of the step."""

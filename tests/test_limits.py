@@ -179,15 +179,15 @@ def test_the_guard_speaks_while_clingo_does_not_listen(limit: float, memory: flo
 def test_a_snapshot_waits_for_the_sketch_that_is_under_way(noisy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begun = threading.Event()
     sketches = []
-    sketch_anew = Candidates._sketch_anew
+    attempts = Candidates._attempts
 
-    def slowly(candidates: Candidates) -> None:
+    def slowly(candidates: Candidates) -> list[Callable[[], None]]:
         sketches.append(candidates)
         begun.set()
         time.sleep(0.2)
-        sketch_anew(candidates)
+        return attempts(candidates)
 
-    monkeypatch.setattr(Candidates, "_sketch_anew", slowly)
+    monkeypatch.setattr(Candidates, "_attempts", slowly)
     search = Search(Trace.load(noisy))
     other = threading.Thread(target=search._candidates.sketch)
     other.start()

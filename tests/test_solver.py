@@ -586,7 +586,11 @@ def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
                 raise KeyboardInterrupt
             grow(self, size)
 
-        with patch.object(engine_module, "AT_ONCE", 500), patch.object(FramedEngine, "grow", interrupted):
+        with (
+            patch.object(engine_module, "AT_ONCE", 500),
+            patch.object(FramedEngine, "grow", interrupted),
+            patch.object(solver_module, "INTERRUPTED", 100.0),
+        ):
             found[most] = solve(trace)
         assert found[most].stopped == "interrupted"
         assert check(trace, found[most].maps[0], found[most].theory) == ()

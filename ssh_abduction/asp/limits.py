@@ -14,6 +14,8 @@ from ssh_abduction.errors import SolverError, brief, is_finite
 # The search for minimal maps of prefixes ends when this share of the time limit is left. Until then it may have no map of the whole trace, and the rest of the
 # time is for finding one, minimal or not.
 RESERVE = 0.2
+# A search of the whole trace that has found no map ends when this share of the time limit is left: it is for making some map without a search.
+LAST = 0.05
 # Seconds between two looks at the clock and at Ctrl-C while clingo is busy: short against the second by which a limit may be overrun, and long against the time
 # that a look takes.
 POLL = 0.05
@@ -80,16 +82,21 @@ class Watch:
 
     @property
     def has_reserve(self) -> bool:
-        """Whether a share of the time limit is still kept for finding any map."""
-        return self._allowed != self._limit
+        """Whether a share of the time limit is still kept for finding any map by a search."""
+        return self._allowed is not None and self._allowed <= self.reserve_begins
 
     @property
     def running(self) -> bool:
         return self._started is not None
 
-    def use_reserve(self) -> None:
-        """From now on the whole time limit may be used."""
-        self._allowed = self._limit
+    def use_reserve(self, last: float = 0.0) -> None:
+        """From now on the whole time limit may be used.
+
+        Args:
+            last: A share of the limit that is still kept, unless it is in use already.
+        """
+        if self._limit is not None and self._allowed is not None:
+            self._allowed = max(self._allowed, self._limit * (1 - last))
 
     def stop(self) -> None:
         self._spent, self._started = self.elapsed(), None

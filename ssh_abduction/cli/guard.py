@@ -21,7 +21,7 @@ from ssh_abduction import program
 from ssh_abduction.asp.limits import POLL, Stop, resident_memory
 from ssh_abduction.asp.process import end_all
 
-LATE = 1.1, 0.4  # times the time limit, and seconds beyond that, after which a search is over, whatever it is at
+LATE = 1.1, 0.8  # times the time limit, and seconds beyond that, after which a search is over, whatever it is at
 LARGE = 1.1, 100.0  # times the memory limit, and MiB beyond that
 DEAF = 1.5  # seconds that a search may take to end after Ctrl-C
 PIECE = 2**16  # characters that are printed at a time

@@ -25,6 +25,7 @@ from functools import cached_property, partial
 from graphlib import CycleError, TopologicalSorter
 from typing import TypeAlias
 
+from ssh_abduction.clock import look_at_clock
 from ssh_abduction.errors import MapError, brief
 from ssh_abduction.judge.gateways import Clash, Sight, clashes, headings, may_show_the_same
 from ssh_abduction.judge.planarity import Edges
@@ -78,9 +79,26 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
     theory = checked_theory(theory).resolve(checked_trace(trace))
     if not isinstance(ssh_map, SSHMap):
         raise MapError(f"map: expected an SSHMap, got {brief(ssh_map)}; take one of a solution, or SSHMap.load")
+    return tuple(violations(trace, ssh_map, theory))
+
+
+def violations(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Violation]:
+    """The same violations one by one, so that the caller who needs only the first one does not wait for the others.
+
+    Args:
+        trace: What the robot saw and did, with views.
+        ssh_map: Any map.
+        theory: The theory, resolved for this trace.
+
+    Yields:
+        Each violation, in the order of `check`.
+    """
     reading = _Reading(trace, ssh_map, theory)
     checks = [(COHERENCE, test) for test in _COHERENCE] + [(name, AXIOMS[name]) for name in theory.axioms if name in AXIOMS]
-    return tuple(Violation(name, tuple(sorted(set(steps))), message) for name, test in checks for steps, message in test(reading))
+    for name, test in checks:
+        look_at_clock()
+        for steps, message in test(reading):
+            yield Violation(name, tuple(sorted(set(steps))), message)
 
 
 def turned(trace: Trace, ssh_map: SSHMap, theory: Theory) -> SSHMap | None:

@@ -17,6 +17,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
+from ssh_abduction.clock import look_at_clock
 from ssh_abduction.maps import DState
 from ssh_abduction.star import SPREAD, Frame, Star
 from ssh_abduction.trace import Action
@@ -106,6 +107,7 @@ def _reading(sights: Sequence[Sight], turns: Turns, axioms: Collection[str], as_
             if "gateway_end" in axioms and not all(_leads(frame, towards) for towards in sight.onward):
                 continue
             for shift in range(max(frame.slots, 1)) if chosen else (0,):
+                look_at_clock()
                 here = (frame, shift)
                 before = zip([*sights[: len(chosen)], sight], [*chosen, here], strict=True)
                 if all(_allowed(other, turned, sight, here, turns, axioms, as_shown) for other, turned in before):

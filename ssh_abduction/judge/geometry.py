@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammainccinv
 
+from ssh_abduction.clock import look_at_clock
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.odometry import Odometry
 from ssh_abduction.theory.theory import Theory
@@ -44,6 +45,8 @@ AT_A_TIME = 50_000
 MOST_SETS = 300_000
 # A bound passes a set only if it is this far from not doing so, as numbers are rounded.
 MARGIN = 1e-3
+# Between two looks at the clock so many steps or returns are read, which takes some milliseconds.
+FEW = 64
 
 
 @dataclass(frozen=True)
@@ -89,11 +92,15 @@ def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[R
     if not trace.has_displacements:
         return
     drifts = _Drifts(trace)
-    found = list(_refused_alone(list(_returns(trace, ssh_map, theory, drifts.none)), drifts, theory))
-    if theory.joint > 1:
-        found += _refused_together(list(_returns(trace, ssh_map, theory, drifts.none, of_arrivals=True)), drifts, theory)
-    for returns, square, most in found:
+    for returns, square, most in _refused(trace, ssh_map, theory, drifts):
         yield Refused(returns, tuple(_closing(trace, i, j) for i, j, _ in returns), square, most)
+
+
+def _refused(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: _Drifts) -> Iterator[_Found]:
+    """What is refused alone comes first: it is found fast, and a caller may need no more."""
+    yield from _refused_alone(list(_returns(trace, ssh_map, theory, drifts)), drifts, theory)
+    if theory.joint > 1:
+        yield from _refused_together(list(_returns(trace, ssh_map, theory, drifts, of_arrivals=True)), drifts, theory)
 
 
 def _closing(trace: Trace, first: int, last: int) -> Closing:
@@ -126,6 +133,8 @@ class _Filter:
             2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
         )  # where a dstate is taken to be, at both ends of a loop
         for t in range(1, size):
+            if t % FEW == 0:
+                look_at_clock()
             x, y, heading = self.pose[t - 1]
             displacement, covariance = trace.steps[t].displacement, trace.covariance(t)
             self.broken[t] = self.broken[t - 1] + (displacement is None)
@@ -216,7 +225,11 @@ class _Drifts:
     def __init__(self, trace: Trace) -> None:
         self._trace, self._odometry = trace, trace.odometry or Odometry()
         self._made: dict[int, _Filter] = {}
-        self.none = self._filter(0)
+
+    @property
+    def none(self) -> _Filter:
+        """The poses without a drift."""
+        return self._filter(0)
 
     def _filter(self, number: int) -> _Filter:
         step = self._odometry.bend / BENDS_A_SIGMA
@@ -227,10 +240,11 @@ class _Drifts:
     def __iter__(self) -> Iterator[tuple[_Filter, float]]:
         numbers = range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1) if self._odometry.bend else [0]
         for n in sorted(numbers, key=lambda n: (abs(n), n)):
+            look_at_clock()
             yield self._filter(n), max(abs(n) - 0.5, 0.0) ** 2 / BENDS_A_SIGMA**2
 
 
-def _returns(trace: Trace, ssh_map: SSHMap, theory: Theory, known: _Filter, of_arrivals: bool = False) -> Iterator[Return]:
+def _returns(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: _Drifts, of_arrivals: bool = False) -> Iterator[Return]:
     """The returns of a map about which displacements say something; all of them, or those between the first steps of visits."""
     place = {s.id: s.place for s in ssh_map.dstates}
     size = min(len(trace), len(ssh_map.labels))
@@ -245,9 +259,11 @@ def _returns(trace: Trace, ssh_map: SSHMap, theory: Theory, known: _Filter, of_a
             groups[2, there].append(t)
     for (freedom, _), steps in groups.items():
         for number, last in enumerate(steps):
-            first = np.array(steps[:number], dtype=int)
+            if number % FEW == FEW - 1:
+                look_at_clock()
             if number:
-                yield from ((int(i), last, freedom) for i in first[known.is_known(first, np.full(number, last))])
+                first = np.array(steps[:number], dtype=int)
+                yield from ((int(i), last, freedom) for i in first[drifts.none.is_known(first, np.full(number, last))])
 
 
 def _most(theory: Theory, freedom: int, together: bool) -> float:
@@ -258,7 +274,7 @@ def _most(theory: Theory, freedom: int, together: bool) -> float:
 
 
 def _refused_alone(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -> Iterator[_Found]:
-    for freedom in (2, 3):
+    for freedom in (2, 3) if returns else ():
         rows = np.array([r for r in returns if r[2] == freedom], dtype=int).reshape(-1, 3)
         most, least = _most(theory, freedom, together=False), np.full(len(rows), np.inf)
         for filtered, unlikely in drifts:
@@ -275,6 +291,8 @@ def _refused_alone(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -
 
 def _refused_together(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -> Iterator[_Found]:
     """The set of two that is refused most clearly. Of more than MOST_SETS sets that the bound does not pass, as many are looked at, evenly spread."""
+    if len(returns) < 2:
+        return
     rows = np.array(sorted(returns, key=lambda r: r[1]), dtype=int).reshape(-1, 3)
     thresholds = {freedom: _most(theory, freedom, together=True) for freedom in (4, 5, 6)}
     worst: _Found | None = None
@@ -301,7 +319,10 @@ def _sets(rows: Steps, filtered: _Filter, most: float) -> Iterator[tuple[Steps, 
     most  the least chi-square at which a set may be refused
     """
     alone = _Alone(filtered, rows)
-    found = [_unsafe(filtered, rows, alone, int(end), most) for end in np.unique(rows[:, 1])]
+    found = []
+    for end in np.unique(rows[:, 1]):
+        look_at_clock()
+        found.append(_unsafe(filtered, rows, alone, int(end), most))
     empty = np.zeros(0, dtype=int)
     first, second = (np.concatenate([empty, *(pair[k] for pair in found)]) for k in (0, 1))
     every = max(1, math.ceil(len(first) / MOST_SETS))

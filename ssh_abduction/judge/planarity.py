@@ -19,6 +19,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
+from ssh_abduction.clock import each_looking, look_at_clock
 from ssh_abduction.star import Openings
 from ssh_abduction.theory.drawing import can_be_drawn
 
@@ -134,6 +135,7 @@ class Edges:
             return False
         choices = [(0, settled)]
         while choices:
+            look_at_clock()
             level, chosen = choices.pop()
             if level == len(others):
                 return True
@@ -200,5 +202,5 @@ def _orders(gateways: Sequence[Arm], told: Sequence[Sequence[Arm]]) -> list[tupl
     orders: list[tuple[Arm, ...]] = [()]
     for gateway in gateways:
         longer = ((*order[:gap], gateway, *order[gap:]) for order in orders for gap in range(min(1, len(order)), len(order) + 1))
-        orders = [order for order in longer if all(_goes_round(order, some) for some in told)]
+        orders = [order for order in each_looking(longer) if all(_goes_round(order, some) for some in told)]
     return orders

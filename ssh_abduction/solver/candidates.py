@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import LimitError
+from ssh_abduction.asp.limits import LimitError, Watch
+from ssh_abduction.clock import each_looking, heeding
 from ssh_abduction.engines.base import Found, Task
 from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import unchecked
@@ -20,6 +24,7 @@ _log = log_of(__name__)
 
 FRAMING = 30.0  # Maps with frames are sought for so many seconds at most: what they are good for is mostly found by then.
 FRAMING_SHARE = 0.4  # Or for such a share of the time that is left, if that is less, so that clingo has the larger part.
+SKETCH_SHARE = 0.4  # A sketch and its check may take such a share of the time that is left for all of them.
 UNMAPPED = 2.0  # Until there is any map that may take so many times as long, as any map is worth more than a better one.
 
 
@@ -37,33 +42,41 @@ class Candidates:
         if self._task.speedups.greedy and self._task.theory.level == "causal":
             self.offer(facts.causal_map(self._task.log.merged(), self._task.trace))
 
-    def sketch(self) -> None:
-        """Where no map of the whole trace is known yet, make some without a search: what goes on beyond the best map of a prefix, or a sketch of all steps."""
+    def sketch(self, seconds: float = math.inf) -> None:
+        """Where no map of the whole trace is known yet, make one without a search: from the best map of a prefix on, or of all steps.
+
+        The map that takes nothing for seen before is large, but it is accepted most often and fastest. So it comes first. Then a smaller one is sought: those
+        that become smallest are tried first. Where time is short, the first one that the checker accepts will do.
+
+        Args:
+            seconds: What it may take. Each sketch may use a share of what is left.
+        """
         with self._sketching:
-            if self._known.best is None and self._task.speedups.greedy and not unchecked(self._task.theory):
-                self._sketch_anew()
-
-    def _sketch_anew(self) -> None:
-        self.merge()
-        if self._known.best is not None:
-            return
-        for sketch in self._beyond_prefix():
-            if self._goes_on_to_end(sketch):
-                self.offer(sketch.map())
-        for sketch in Sketch.all_of(self._task.trace.steps[0], self._task.theory):
-            if self._goes_on_to_end(sketch):
-                self.offer(sketch.map())
+            if self._known.best is not None or not self._task.speedups.greedy or unchecked(self._task.theory):
                 return
+            whole = Watch().part(seconds)
+            *smaller, surest = self._attempts()
+            for share, attempt in ((1.0, surest), *((SKETCH_SHARE, attempt) for attempt in smaller)):
+                before = self._known.best
+                with suppress(LimitError), heeding(whole.part(share * whole.left()).check):
+                    attempt()
+                if seconds < math.inf and attempt is not surest and self._known.best is not before:
+                    return
 
-    def _beyond_prefix(self) -> Iterator[Sketch]:
-        partial = self._known.partial
-        if partial:
-            yield Sketch.beyond(partial, self._task.trace.prefix(len(partial.labels)), self._task.theory)
+    def _attempts(self) -> list[Callable[[], None]]:
+        """The ways to make a map without a search. Those that make small maps come first."""
+        known, trace, theory = self._known.partial, self._task.trace, self._task.theory
+        sketches = Sketch.all_of(trace.steps[0], theory)
+        if known is not None:
+            sketches.insert(0, Sketch.beyond(known, trace.prefix(len(known.labels)), theory))
+        return [self.merge, *(partial(self._go_on_to_end, sketch) for sketch in sketches)]
 
-    def _goes_on_to_end(self, sketch: Sketch) -> bool:
+    def _go_on_to_end(self, sketch: Sketch) -> None:
+        """Offer a sketch that goes on to the end of the trace, if the trace does not contradict it before."""
         trace, done = self._task.trace, len(sketch.labels)
-        later = zip(trace.actions[done - 1 :], trace.steps[done:], strict=True)
-        return all(sketch.extend(action, step) for action, step in later)
+        later = each_looking(zip(trace.actions[done - 1 :], trace.steps[done:], strict=True))
+        if all(sketch.extend(action, step) for action, step in later):
+            self.offer(sketch.map())
 
     def frame(self, speedups: Speedups) -> None:
         """Make maps in which places have frames, though the theory does not ask for any.
@@ -76,10 +89,11 @@ class Candidates:
         seconds = min(FRAMING, FRAMING_SHARE * watch.left())
         part = watch.part(UNMAPPED * seconds)
         try:
-            for ssh_map in maps_with_frames(self._task.trace, self._task.theory, part, speedups):
-                part.shorten(seconds)
-                self.offer(ssh_map)
-                self._report()
+            with heeding(part.check):
+                for ssh_map in maps_with_frames(self._task.trace, self._task.theory, part, speedups):
+                    part.shorten(seconds)
+                    self.offer(ssh_map)
+                    self._report()
         except LimitError:
             watch.check()
 

@@ -10,7 +10,7 @@ import random
 import time
 
 from ssh_abduction.errors import SSHError
-from ssh_abduction.judge.checker import Violation, check, unchecked
+from ssh_abduction.judge.checker import Violation, check, unchecked, violations
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.evidence import Equality, evidence_of
 from ssh_abduction.theory.theory import Theory
@@ -77,7 +77,8 @@ class Judging:
 
     def accepts(self, ssh_map: SSHMap) -> bool:
         """Whether a map of the whole trace that nothing proves yet is known to satisfy all axioms."""
-        accepted = not unchecked(self._theory) and not check(self._trace, ssh_map, self._theory) and not self.why_refused(ssh_map)
+        breaks = next(violations(self._trace, ssh_map, self._theory), None)
+        accepted = not unchecked(self._theory) and breaks is None and not self.why_refused(ssh_map)
         self._accepted = ssh_map if accepted else self._accepted
         return accepted
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 
 from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import LimitError, StageTimeError
+from ssh_abduction.asp.limits import LAST, LimitError, StageTimeError
 from ssh_abduction.engines.base import Engine, Found, Task
 from ssh_abduction.engines.refusing import first_accepted
 from ssh_abduction.engines.stepwise import StepEngine, paths_needed
@@ -62,7 +62,7 @@ class Prefixes:
         size, steps = min(len(self._task.trace), self.start), len(self._task.trace)
         while True:
             if size == steps:
-                self._task.watch.use_reserve()  # which is for a search like this one
+                self._task.watch.use_reserve(LAST)  # which is for a search like this one
             _log.debug("%s is given %d of %d steps", type(self.engine).__name__, size, steps)
             self.engine.grow(size)
             minimal = self.minimise()

@@ -8,6 +8,8 @@ from dataclasses import replace
 from itertools import chain, islice
 from typing import TypeAlias
 
+from ssh_abduction.asp.limits import LimitError, Watch
+from ssh_abduction.clock import heeding, look_at_clock
 from ssh_abduction.maps import Fit, SSHMap
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.trace import Trace
@@ -22,6 +24,9 @@ TOO_SMALL, TOO_LARGE = 1.5, 2.0
 STANDING = 2.0
 # Displacements that agree to the last digit would make it 0.
 NEVER_LESS = 0.01
+
+# So many seconds beyond the limit it may take to tell how well the first map closes.
+OVERTIME = 0.3
 
 _Key: TypeAlias = tuple[tuple[int, ...], tuple[int | None, ...], tuple[int, ...]]
 
@@ -45,15 +50,35 @@ class Ranking:
     def ranked(self, maps: Iterator[SSHMap], over: Callable[[], bool]) -> Iterator[SSHMap]:
         """The same maps, the one that closes best first.
 
-        over  whether the limits are over: then maps come as they are found, but for the first one without how well they close
+        Args:
+            maps: As they are found.
+            over: Whether the limits are over. Then maps come as they are found, without how well they close; for the first one OVERTIME more may be used.
         """
+        overtime = Watch(OVERTIME)
+
+        def look(first: bool) -> None:
+            if over():
+                if not first:
+                    raise LimitError("time limit")
+                if not overtime.running:
+                    overtime.start()
+                overtime.check()
+
+        def fitted(ssh_map: SSHMap, first: bool = False) -> SSHMap:
+            try:
+                with heeding(lambda: look(first)):
+                    look_at_clock()
+                    return self.fitted(ssh_map)
+            except LimitError:
+                return ssh_map
+
         held: list[SSHMap] = []
         for ssh_map in maps:
-            held.append(ssh_map if held and over() else self.fitted(ssh_map))
+            held.append(fitted(ssh_map, first=not held))
             if len(held) == RANKED:
                 break
         yield from sorted(held, key=lambda m: m.fit.chi2 if m.fit else math.inf)
-        yield from (ssh_map if over() else self.fitted(ssh_map) for ssh_map in maps)
+        yield from map(fitted, maps)
 
 
 def in_order(maps: Sequence[SSHMap], counts: Iterable[int]) -> tuple[SSHMap, ...]:

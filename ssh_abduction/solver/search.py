@@ -52,6 +52,7 @@ from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import LimitError, StageTimeError, Stop, Watch, check_limit
 from ssh_abduction.asp.rules import check_rules
 from ssh_abduction.checks import a_flag, an_instance, one_of
+from ssh_abduction.clock import each_heeding, heeding
 from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Found, Task, cost_as_counted
 from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.errors import SolverError, TheoryError, brief, is_whole
@@ -80,6 +81,9 @@ ONE_MORE_SHARE = 0.1  # Or for such a share of the time that these took, if that
 FRAME_AFTER = 1.0  # After so many seconds step by step a map with frames is sought, where the theory does not ask for one: most traces are solved by then.
 READABLE = 60  # Traces up to so many steps are given to the readable encodings, which know places and faults; longer ones would take more memory than there is.
 SHORTEST = 0.05  # A trace that was mended has so many seconds at least.
+# To make some map where a search was stopped without one, or to check it, may take so many seconds beyond the limit, and such a share of it.
+OVERTIME, OVERTIME_SHARE = 0.5, 0.05
+INTERRUPTED = 1.0  # Or so many seconds after Ctrl-C, or where memory is over.
 REASONING = 5.0  # For so many seconds it is sought what all minimal maps share, where the search took less and has no time limit.
 ALL = Speedups()
 _log = log_of(__name__)
@@ -188,6 +192,7 @@ class Search:
         self._news: tuple[Cost | None, Bound] = (None, Bound())  # what was known at the last report
         self._watch = Watch(limit, memory, self._report)
         self.limit, self.memory = limit, memory
+        self._watch.start()  # to compare all pairs of steps may take long
         self._task = Task.of(trace, self.theory, self._watch, speedups)
         self._known = Known(self.theory)
         self._judging = Judging(trace, self.theory)
@@ -197,6 +202,7 @@ class Search:
         self._prefixes = Prefixes(self._task, self._known, self._judging, engine, maps, self._report)
         if after:
             self._take_over(after, minimal)
+        self._watch.stop()
 
     def __repr__(self) -> str:
         best = f", best {counted(len(self.best.dstates), 'dstates')}" if self.best else ""
@@ -323,9 +329,10 @@ class Search:
         _log.info("search of %r under %r, with %s", self.trace, self.theory, _name(self._engine))
         self._watch.start()
         try:
-            self._make_first_map()
-            self._find_minimum()
-            yield from self._list_maps()
+            with heeding(self._watch.check):
+                self._make_first_map()
+                self._find_minimum()
+            yield from each_heeding(self._watch.check, self._list_maps())
         except StageTimeError:
             self._known.stopped = "maps limit" if self.count == self._most else "time limit"
         except LimitError as limit:
@@ -368,9 +375,8 @@ class Search:
         takes_all = isinstance(engine, StepEngine) and not self._goes_on and FEW_STEPS < steps <= AT_ONCE
         may_frame = takes_all and self._task.speedups.framing
         may_settle = takes_all and self._task.speedups.ways and self._asked_speedups.names
-        if (may_frame or may_settle) and not self._find_minimum_soon():
+        if (may_frame or may_settle) and not self._find_minimum_soon(FRAME_AFTER):
             _log.info("no minimum after %.1f s step by step", self._watch.elapsed())
-            self._prefixes.start = max(self._prefixes.start, self.prefix)
             if may_frame:
                 _log.info("maps in which places have frames are sought as candidates")
                 self._candidates.frame(self._asked_speedups)
@@ -422,12 +428,13 @@ class Search:
             self.interrupt()
         return maps, search.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
 
-    def _find_minimum_soon(self) -> bool:
-        """Find the minimal cost step by step, if that is done soon."""
-        self._watch.end_stage_after(min(FRAME_AFTER, FRAMING_SHARE * self._watch.left()))
+    def _find_minimum_soon(self, seconds: float) -> bool:
+        """Find the minimal cost step by step, if that is done within so many seconds from the start, or a share of the time that is left."""
+        self._watch.end_stage_after(self._watch.elapsed() + min(seconds, FRAMING_SHARE * self._watch.left()))
         try:
             self._prefixes.find_minimum()
         except StageTimeError:
+            self._prefixes.start = max(self._prefixes.start, self.prefix)
             return False
         finally:
             self._watch.end_stage_after(math.inf)
@@ -498,12 +505,21 @@ class Search:
         """Where the search was stopped: some map of the whole trace, if there was none, and a bound that takes no search."""
         if not self.stopped or self.status is Status.OPTIMAL:
             return
-        if self.best is None and self.stopped == "time limit" and self._watch.has_reserve and not self._mends:
+        may_salvage = self.best is None and self.stopped == "time limit" and self._watch.has_reserve and not self._mends
+        with suppress(KeyboardInterrupt):
+            self._candidates.sketch(self._overtime)
+        if may_salvage:
             self._salvage()
-        self._candidates.sketch()
         self._count_apart()
         if self.best is not None and self.status is Status.UNKNOWN:
             self._known.status = Status.FEASIBLE
+
+    @property
+    def _overtime(self) -> float:
+        """The seconds that are left for making some map without a search, or for checking one: a little more than the limit allows."""
+        if self.stopped != "time limit" or self.limit is None:
+            return INTERRUPTED
+        return max(self._watch.left(), 0.0) + OVERTIME_SHARE * self.limit + OVERTIME
 
     def _salvage(self) -> None:
         """In the last part of the time limit, look for any map of the whole trace."""
@@ -512,8 +528,9 @@ class Search:
         self._watch.start()
         self._known.lower = None  # a map as cheap as proved is what was not found
         try:
-            self._prefixes.engine.grow(len(self.trace))
-            self._known.status = Status.OPTIMAL if self._prefixes.minimise() else Status.UNSATISFIABLE
+            with heeding(self._watch.check):
+                self._prefixes.engine.grow(len(self.trace))
+                self._known.status = Status.OPTIMAL if self._prefixes.minimise() else Status.UNSATISFIABLE
         except LimitError as limit:
             self._known.stopped = limit.reason
         except KeyboardInterrupt:
@@ -523,7 +540,8 @@ class Search:
     def _give_best_map(self) -> Iterator[SSHMap]:
         """Where no minimal map was listed, the best one known is the answer, once it has passed the checker."""
         if self.status in (Status.FEASIBLE, Status.OPTIMAL) and not self.count and self.best is not None:
-            self._judging.pass_map(self.best, self.prefix, self._watch.elapsed())
+            with suppress(LimitError), heeding(Watch().part(self._overtime).check):
+                self._judging.pass_map(self.best, self.prefix, self._watch.elapsed())
             self._known.count = 1
             self._note(self.best, self._known.cost)
             yield self.best
@@ -534,7 +552,8 @@ class Search:
         self._watch.start()
         spent = self._watch.elapsed()
         self._watch.end_stage_after(spent + max(REASONING, spent) if self._watch.left() == math.inf else math.inf)
-        self._rivals.reason()
+        with heeding(self._watch.check):
+            self._rivals.reason()
         self._watch.end_stage_after(math.inf)
         self._watch.stop()
 
@@ -612,7 +631,7 @@ class Search:
         one_of("stopped", stopped, get_args(Stop), SolverError)
         with suppress(Exception):  # what the other thread changes meanwhile: a bound is a bound, and a map a map, without that
             if self.status in (Status.UNKNOWN, Status.FEASIBLE):
-                self._candidates.sketch()
+                self._candidates.sketch(OVERTIME)
         self._known.raise_bound(self._prefixes.engine.bound)
         best = self.best
         if best is not None and self.status is Status.UNKNOWN:

@@ -10,6 +10,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -17,7 +19,7 @@ from typing import Any
 
 from ssh_abduction.errors import SolverError
 from ssh_abduction.steps.noise import Noise, noise_in
-from ssh_abduction.trace import Trace, checked_trace
+from ssh_abduction.trace import Trace, View, checked_trace
 from ssh_abduction.words import counted
 
 RESTS_ON = frozenset({"functional_view", "deterministic"})  # the axioms that make apart steps different dstates
@@ -58,13 +60,22 @@ class Certificate:
         checked_trace(trace)
         words: list[list[Any]] = []
         written = 0
-        for i, j in combinations(self.clique, 2):
-            if word := _word(trace, i, j):
-                words.append([i, j, list(word)])
+        for i, j in self._pairs_alike(trace):
+            word = _word(trace, i, j)
+            words.append([i, j, list(word)])
             written += len(word)
             if written > WRITTEN:
                 return {"clique": list(self.clique), "refuted": list(self.refuted)}
         return {"clique": list(self.clique), "words": words, "refuted": list(self.refuted)}
+
+    def _pairs_alike(self, trace: Trace) -> Iterator[tuple[int, int]]:
+        """The pairs of steps of the clique that show one view, in order. All other pairs, of which there may be millions, need no word."""
+        alike: dict[View | None, list[int]] = {}
+        for step in self.clique:
+            alike.setdefault(trace.steps[step].view, []).append(step)
+        for i in self.clique:
+            same = alike[trace.steps[i].view]
+            yield from ((i, j) for j in same[bisect_right(same, i) :])
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,8 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TypeAlias, TypeVar
 
+from ssh_abduction.clock import each_looking, look_at_clock
+
 Ends: TypeAlias = tuple[int, ...]
 Place = TypeVar("Place", bound=Hashable)
 State = TypeVar("State")
@@ -99,7 +101,7 @@ def _orders(ends: Sequence[int], allows: Callable[[Ends], bool]) -> list[Ends]:
     orders: list[Ends] = [()]
     for end in ends:
         longer = ((*order[:gap], end, *order[gap:]) for order in orders for gap in range(min(1, len(order)), len(order) + 1))
-        orders = [order for order in longer if allows(order)]
+        orders = [order for order in each_looking(longer) if allows(order)]
     return orders
 
 
@@ -165,8 +167,10 @@ def has_way(start: State, steps: Sequence[Step], ways: Callable[[State, Step], I
     gone: list[Iterator[State]] = []
     state = start
     while len(gone) < len(steps):
+        look_at_clock()
         gone.append(ways(state, steps[len(gone)]))
         while (following := next(gone[-1], None)) is None:
+            look_at_clock()
             gone.pop()
             if not gone:
                 return False

@@ -20,6 +20,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.clock import look_at_clock
 from ssh_abduction.theory.loops import Array, Loops, Reckoning, Steps
 
 Mask: TypeAlias = NDArray[np.bool_]
@@ -83,10 +84,12 @@ class Together:
             return None
         ends, starts = np.unique(rows[:, 1], return_index=True)
         for end, start, stop in zip(ends.tolist(), starts.tolist(), [*starts[1:].tolist(), len(rows)], strict=True):
+            look_at_clock()
             if not new[:stop].any():
                 continue
             later = np.arange(start, stop)
             for earlier in self._overlapping(later, new):
+                look_at_clock()
                 pairs = self._unsafe(end, later, earlier, new)
                 excess = self._least_excess(end, *pairs)
                 if len(excess) and excess.max() > most:

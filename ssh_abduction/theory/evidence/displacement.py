@@ -27,6 +27,7 @@ from functools import cached_property
 from operator import is_
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
+from ssh_abduction.clock import look_at_clock
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
@@ -481,4 +482,5 @@ def _hold(equalities: Collection[Equality], labels: Sequence[int], places: Seque
 def _parts(size: int, most: int = AT_A_TIME) -> Iterator[slice]:
     """So many loops in parts that fit into memory."""
     for start in range(0, size, most):
+        look_at_clock()
         yield slice(start, start + most)

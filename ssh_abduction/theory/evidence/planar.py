@@ -22,6 +22,7 @@ from functools import cache
 from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
 
+from ssh_abduction.clock import look_at_clock
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.star import Openings
 from ssh_abduction.theory.drawing import Ends, can_be_drawn, has_way, is_planar
@@ -181,6 +182,7 @@ def _slots_of(
     groups = list(dict.fromkeys(group[s] for s in here))
     found: dict[tuple[int, ...], dict[End, int]] = {}
     for turned in product(*(range(SLOTS if i else 1) for i in range(len(groups)))):
+        look_at_clock()
         quarters = dict(zip(groups, turned, strict=True))
         faced = {s: (slot[s] + quarters[group[s]]) % SLOTS for s in here}
         seen = {tuple(star[(k - faced[s]) % SLOTS] for k in range(SLOTS)) for s in here for star in shown.stars[s]}
@@ -330,6 +332,7 @@ def _fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
     while True:
         begin = 0
         while begin < len(moves):
+            look_at_clock()
             fewer = moves[:begin] + moves[begin + size :]
             if cross(fewer):
                 moves = fewer
@@ -344,6 +347,7 @@ def _split(labels: Mapping[int, int], steps: Sequence[int], cross: Callable[[Map
     """Labels of these steps by which as few of them are one dstate as let the edges cross still."""
     new = max(labels.values()) + 1
     for step in steps:
+        look_at_clock()
         finer = {**labels, step: new + step}
         if cross(finer):
             labels = finer

@@ -1,0 +1,70 @@
+"""Lets whatever takes long look at the clock and at Ctrl-C, wherever it is called from.
+
+A search knows its limits. The checker, evidence and sketches work for it, but do not know the search. So a search names the function that looks at
+its limits (`heeding`), and whatever may take longer than a moment calls `look_at_clock` in its loops. Where no search is under way, that does nothing.
+
+>>> def over():
+...     raise TimeoutError("the time is over")
+>>> look_at_clock()
+>>> with heeding(over):
+...     look_at_clock()
+Traceback (most recent call last):
+TimeoutError: the time is over
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TypeVar
+
+Item = TypeVar("Item")
+
+_check: ContextVar[Callable[[], None] | None] = ContextVar("check", default=None)
+
+
+def look_at_clock() -> None:
+    """Call the function that `heeding` named last in this thread. It raises where the work is to end."""
+    check = _check.get()
+    if check is not None:
+        check()
+
+
+def each_looking(items: Iterable[Item]) -> Iterator[Item]:
+    """The same items, with a look at the clock before each."""
+    for item in items:
+        look_at_clock()
+        yield item
+
+
+@contextmanager
+def heeding(check: Callable[[], None]) -> Iterator[None]:
+    """Let `look_at_clock` call this function within the context, after those of the contexts around it.
+
+    Args:
+        check: Raises where the work is to end. It is called often, so it should take microseconds.
+    """
+    around = _check.get()
+
+    def both() -> None:
+        if around is not None:
+            around()
+        check()
+
+    before = _check.set(both)
+    try:
+        yield
+    finally:
+        _check.reset(before)
+
+
+def each_heeding(check: Callable[[], None], items: Iterator[Item]) -> Iterator[Item]:
+    """The same items, each made within `heeding(check)`; whoever uses an item meanwhile does so outside of it."""
+    while True:
+        with heeding(check):
+            try:
+                item = next(items)
+            except StopIteration:
+                return
+        yield item

@@ -1,0 +1,141 @@
+"""What takes long looks at the clock wherever it is called from, and an answer is left when the time is over."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from unittest.mock import patch
+
+import pytest
+
+from benchmarks.instances import maze, rectangle
+from ssh_abduction import Status, Theory, Trace, solve
+from ssh_abduction.clock import each_heeding, heeding, look_at_clock
+from ssh_abduction.fit import fit
+from ssh_abduction.guesses.tree import Sketch
+from ssh_abduction.judge.checker import check
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver import candidates
+from ssh_abduction.solver import search as solver
+from ssh_abduction.solver.judging import Judging
+from ssh_abduction.steps.certificate import Certificate
+from ssh_abduction.theory.evidence import Planar
+
+TURNED = {"right": -math.pi / 2, "left": math.pi / 2, "around": math.pi}
+
+
+class OverError(Exception):
+    """The time is over."""
+
+
+def over() -> None:
+    raise OverError
+
+
+def driven(trace: Trace, wrong: int = 0) -> Trace:
+    """The trace with displacements, some of which are wrong by metres."""
+    steps, chance = list(trace.steps), random.Random(0)
+    for t, action in enumerate(trace.actions, 1):
+        travels = action.kind == "travel"
+        steps[t] = replace(steps[t], displacement=(5.0, 0.0, 0.0) if travels else (0.0, 0.0, TURNED[str(action.turn)]))
+    for t in chance.sample([t for t, action in enumerate(trace.actions, 1) if action.kind == "travel"], wrong):
+        steps[t] = replace(steps[t], displacement=(chance.uniform(15, 30), chance.uniform(15, 30), 0.0))
+    return replace(trace, steps=tuple(steps))
+
+
+def sketched(trace: Trace, theory: Theory, homing: bool = True, framed: bool = True) -> SSHMap:
+    sketch = Sketch(trace.steps[0], theory, homing, framed)
+    assert all(sketch.extend(action, step) for action, step in zip(trace.actions, trace.steps[1:], strict=True))
+    return sketch.map()
+
+
+DRIVEN = driven(maze(3, 3, steps=80, seed=0).trace)
+USED = Theory.topological().resolve(DRIVEN)
+RING = rectangle(2).trace
+PLANAR = Theory.topological().replace(planar=True).resolve(RING)
+GATEWAYS = Trace.from_steps("abab", ["travel", "around", "travel"], stars=[[0, 120], [60, 180], [0, 120], [60, 180]])
+IN_TOLERANCE = Theory.topological().resolve(GATEWAYS)
+MAP = sketched(DRIVEN, USED)
+
+LONG: dict[str, Callable[[], object]] = {
+    "checker": lambda: check(DRIVEN, MAP, USED),
+    "gateways": lambda: check(GATEWAYS, sketched(GATEWAYS, IN_TOLERANCE, framed=False), IN_TOLERANCE),
+    "displacements of two returns": lambda: Judging(driven(maze(3, 3, steps=80, seed=0).trace), USED).refusal(MAP),
+    "crossings": lambda: Planar.of(PLANAR).refuse(RING, solve(RING, maps=1).maps[0]),
+    "fit": lambda: fit(DRIVEN, MAP),
+}
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_what_takes_long_looks_at_the_clock(name: str) -> None:
+    looks = []
+    with heeding(lambda: looks.append(None)):
+        LONG[name]()
+    assert looks
+    with heeding(over), pytest.raises(OverError):
+        LONG[name]()
+
+
+def test_limits_within_limits_are_all_heeded() -> None:
+    calls: list[str] = []
+    with heeding(lambda: calls.append("outer")), heeding(lambda: calls.append("inner")):
+        look_at_clock()
+    assert calls == ["outer", "inner"]
+    look_at_clock()  # after that nothing is heeded
+    assert len(calls) == 2
+
+
+def test_whoever_uses_an_item_is_not_under_the_limit_of_whoever_makes_it() -> None:
+    def made() -> object:
+        look_at_clock()
+        yield 1
+
+    with pytest.raises(OverError):
+        list(each_heeding(over, iter(made())))  # type: ignore[call-overload]
+    for _ in each_heeding(over, iter([1])):
+        look_at_clock()
+
+
+@pytest.mark.parametrize(("steps", "wrong", "stars"), [(60, 0, False), (60, 6, False), (150, 20, False), (150, 20, True)])
+def test_there_is_a_map_when_the_time_is_over(steps: int, wrong: int, stars: bool) -> None:
+    """Though the checker refuses the sketches that take places for some seen before, as displacements are wrong."""
+    trace = driven(maze(4, 4, steps=steps, seed=steps, stars=stars).trace, wrong)
+    with patch.multiple(solver, OVERTIME=100.0):
+        solution = solve(trace, limit=1e-6)
+    assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
+    assert check(trace, solution.maps[0], solution.theory) == ()
+
+
+def test_a_sketch_that_the_checker_refuses_is_not_the_last_one() -> None:
+    trace = driven(maze(3, 3, steps=60, seed=1).trace, 4)
+    theory = Theory.topological().resolve(trace)
+    assert check(trace, sketched(trace, theory), theory)
+    with patch.multiple(solver, OVERTIME=100.0), patch.object(candidates, "SKETCH_SHARE", 1.0):
+        assert solve(trace, limit=1e-6).maps
+
+
+def test_no_sketch_takes_all_the_time() -> None:
+    """The first one uses all that is left for it; others still get their share."""
+    trace = driven(maze(3, 3, steps=60, seed=1).trace, 4)
+    tried = []
+
+    def deaf(self: object, sketch: Sketch) -> None:
+        tried.append(sketch)
+        over_time = candidates.LimitError("time limit")
+        raise over_time
+
+    with patch.multiple(solver, OVERTIME=100.0), patch.object(candidates.Candidates, "_go_on_to_end", deaf):
+        assert solve(trace, limit=1e-6).status is Status.UNKNOWN
+    assert len(tried) == len(Sketch.all_of(trace.steps[0], Theory.topological().resolve(trace)))
+
+
+def test_a_certificate_is_written_without_a_look_at_each_pair() -> None:
+    """Of 3,000 steps that show different views no pair needs a word."""
+    trace = Trace.from_steps([*range(3000), 0, 1], ["travel"] * 3000 + ["right"])
+    asked = []
+    with patch("ssh_abduction.steps.certificate._word", side_effect=lambda *pair: asked.append(pair) or ("travel",)):
+        written = Certificate((*range(3000), 3001)).to_dict(trace)
+    assert [pair[1:] for pair in asked] == [(1, 3001)]
+    assert written["words"] == [[1, 3001, ["travel"]]]
