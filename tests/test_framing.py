@@ -78,7 +78,7 @@ def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
 def test_a_maze_without_stars_has_a_small_map_before_the_proof(theory: Theory) -> None:
     """In the second part of its search it is interrupted at once; the robot was in 32 dstates."""
     walk = maze(3, 3, steps=400, seed=0)
-    with patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, KeyboardInterrupt]):
+    with patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, StageTimeError, KeyboardInterrupt]):
         solution = solve(walk.trace, theory)
     assert (solution.status, solution.stopped, solution.count) == (Status.FEASIBLE, "interrupted", 1)
     assert solution.cost
@@ -89,7 +89,7 @@ def test_a_maze_without_stars_has_a_small_map_before_the_proof(theory: Theory) -
 def test_a_maze_of_loops_has_a_map_smaller_than_a_sketch() -> None:
     trace = maze(3, 3, steps=400, seed=1, loops=0.5).trace
     sketched = solve(trace, limit=1e-9)
-    with patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, KeyboardInterrupt]):
+    with patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, StageTimeError, KeyboardInterrupt]):
         found = solve(trace)
     assert found.cost
     assert sketched.cost

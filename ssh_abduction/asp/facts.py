@@ -802,10 +802,46 @@ def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nod
 
 
 def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
-    """The segments of paths_framed.lp, and the pairs of them that cannot be one path in either direction."""
+    """The segments of a control, and the pairs of them that cannot be one path in either direction."""
     segments = sorted(_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("segment", 1))
     distinct = {tuple(_atom(atom.symbol)[1]) for atom in control.symbolic_atoms.by_signature("distinct", 3)}
     return segments, [(g, h) for g, h, direction in distinct if direction == 1 and (g, h, -1) in distinct]
+
+
+@dataclass(frozen=True)
+class Segments:
+    """What paths_frameless.lp says of segments and places before any two of them are one.
+
+    Attributes:
+        places: The places that turns tell apart.
+        elsewhere: Pairs of places that are not one.
+        travels: A segment, and two places that a travel along it leads between, in its direction.
+        segments: All segments.
+        distinct: Pairs of segments that are not one path.
+    """
+
+    places: list[int]
+    elsewhere: list[tuple[int, int]]
+    travels: list[tuple[int, int, int]]
+    segments: list[int]
+    distinct: list[tuple[int, int]]
+
+    @classmethod
+    def read(cls, control: Control) -> Segments:
+        """What a control says in which the parts base and segments are grounded."""
+        symbols = control.symbolic_atoms
+
+        def atoms(name: str, arity: int) -> list[tuple[int, ...]]:
+            return [tuple(_atom(atom.symbol)[1]) for atom in symbols.by_signature(name, arity)]
+
+        places = sorted(place for (place,) in atoms("visited", 1))
+        elsewhere, travels = [(c, p) for c, p in atoms("elsewhere", 2)], [(g, c, b) for g, c, b in atoms("travel_on", 3)]
+        return cls(places, elsewhere, travels, *read_rivals(control))
+
+
+def tight_facts(homes: Mapping[int, Iterable[int]]) -> str:
+    """For each place the fixed places that it may be, as facts for paths_frameless.lp."""
+    return "tight.\n" + "\n".join(f"fixed({place},{home})." for place, found in homes.items() for home in found)
 
 
 def pinned_facts(segments: Iterable[int]) -> str:

@@ -18,7 +18,8 @@ no places and paths. All labels with the fewest dstates have to be seen for that
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import chain, islice, pairwise
 from typing import TypeAlias
@@ -30,6 +31,7 @@ from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker, Control, mapped
 from ssh_abduction.engines.base import Found, Task, next_charted_size
 from ssh_abduction.engines.doubts import Settled
+from ssh_abduction.engines.homes import fewest_paths, homes_of
 from ssh_abduction.engines.naming import NamedLabels
 from ssh_abduction.engines.paths import PREPARING
 from ssh_abduction.engines.refusing import all_accepted
@@ -49,7 +51,11 @@ BETTERING = 20_000
 # Labels of all steps, options of clasp, and the parts of the program.
 _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...], tuple[str, ...]]
 # The parts of the program that say which places and paths fit labels; and that answers are listed, too, which differ in paths alone.
-PARTS, EACH = ("base", "least", "paths"), ("each",)
+# TOLD is what segments tell of places and of each other before any two of them are one.
+TOLD, EACH = ("base", "segments"), ("each",)
+PARTS = (*TOLD, "least", "paths")
+# Whether there are just as many places as no two of which can be one is asked for at most so many labels, and so many conflicts each: it mostly shows at once.
+TIGHT, TIGHTLY = 5, 2000
 
 
 @dataclass(frozen=True)
@@ -216,10 +222,18 @@ class PlacesAndPaths:
         self._forbidden = 0  # sets of links, so far
         self._told: set[tuple[int, int]] = set()  # dstates of whose paths clingo was told, as `NamedLabels.names` has them
         self._asked: tuple[_Question, clingo.Control] | None = None  # the last labels, and the control for their places and paths
+        self._tight: dict[
+            tuple[int, ...], tuple[Mapping[int, list[int]], Found]
+        ] = {}  # labels of which the fewest places are known, with homes and a best map
+        self._failed: set[tuple[int, ...]] = set()  # labels for which that was tried in vain
 
     def forget(self) -> None:
         """There is to be another control, for other labels."""
         self._told = set()
+        self._forget_tight()
+
+    def _forget_tight(self) -> None:
+        self._tight, self._failed, self._asked = {}, set(), None
 
     def tell_again(self) -> None:
         told, self._told = self._told, set()
@@ -230,7 +244,7 @@ class PlacesAndPaths:
         """From now on not all of these equalities hold."""
         if any(equality.of == "place" for equality in equalities):
             self._refused.append(equalities)
-            self._asked = None
+            self._forget_tight()
 
     def _tell_of(self, dstates: Collection[tuple[int, int]]) -> None:
         """Tell clingo what the paths of these dstates demand, of which it does not know yet."""
@@ -246,7 +260,47 @@ class PlacesAndPaths:
             self._told.update(dstates)
 
     def fits(self, labels: Sequence[int]) -> bool:
-        return self._has_paths(self._path_control(labels))
+        return self._tightly(labels) is not None or self._has_paths(self._path_control(labels))
+
+    def _tightly(self, labels: Sequence[int]) -> Found | None:
+        """A best map with these dstates, where that has no more places than no two of which can be one (`engines/homes.py`). None where that is not known."""
+        key = tuple(labels)
+        if key in self._tight:
+            return self._tight[key][1]
+        if "places" not in self._task.theory.priorities or key in self._failed or len(self._failed) >= TIGHT:
+            return None
+        with self._asker.grounding_timed():
+            control = self._control_for(self._links_of(labels), labels, far=self._far_away(labels), parts=TOLD)
+            told = facts.Segments.read(control)
+            homes = homes_of(told)
+            if homes is not None:
+                _go_on_at_home(control, homes, (*PARTS, *EACH))
+        best = None if homes is None else self._best_at_home(labels, control, fewest_paths(told))
+        if best is None or homes is None:
+            self._failed.add(key)
+            return None
+        self._tight[key] = homes, best
+        self._asked = (key, (), (*PARTS, *EACH)), control
+        return best
+
+    def _best_at_home(self, labels: Sequence[int], control: Control, fewest: int) -> Found | None:
+        """The best map that a control for some homes has, if it is known that no other map with these dstates is better.
+
+        fewest  a lower bound on the number of paths
+        """
+        places_first = next(count for count in self._task.theory.priorities if count in ("places", "paths")) == "places"
+        reader = facts.PathReader(control, self._task.trace, self._task.theory, self.named.chart, labels)
+        answers = mapped(reader.map_of, self._asker.answers(reader.read, "opt", 0, control=control, conflicts=TIGHTLY))
+        best: Found | None = None
+        with closing(answers):
+            while True:
+                try:
+                    ssh_map = next(answers).without_headings()
+                except StopIteration as end:
+                    return best if end.value and places_first else None
+                best = Found.of(ssh_map, self._task.theory)
+                if len(ssh_map.paths) <= fewest:
+                    return best
 
     def why_not(self, labels: list[int]) -> list[int] | None:
         """Labels that no places and paths fit; None where some do."""
@@ -308,7 +362,7 @@ class PlacesAndPaths:
         far: Collection[_Far] = (),
         single: bool = False,
         parts: Iterable[str] = PARTS,
-    ) -> clingo.Control:
+    ) -> Control:
         """A control for the places and paths of dstates that are linked so, and of these."""
         control = Control(options, self._asker.watch.check, PREPARING)
         control.load_encodings("paths_frameless", "preference")
@@ -323,7 +377,12 @@ class PlacesAndPaths:
         key = tuple(labels), tuple(options), tuple(parts)
         if self._asked is None or self._asked[0] != key:
             with self._asker.grounding_timed():
-                control = self._control_for(self._links_of(labels), labels, options, far=self._far_away(labels), parts=parts)
+                at_home = key[0] in self._tight
+                control = self._control_for(
+                    self._links_of(labels), labels, options, far=self._far_away(labels), parts=TOLD if at_home else parts
+                )
+                if at_home:
+                    _go_on_at_home(control, self._tight[key[0]][0], parts)
             self._asker.watch.check()
             self._asked = key, control
         return self._asked[1]
@@ -336,6 +395,9 @@ class PlacesAndPaths:
 
     def improving_maps(self, labels: Sequence[int]) -> Iterator[Found]:
         """Maps with these dstates, each as good as the one before or better, the last one best; none if no places and paths fit them."""
+        if (best := self._tightly(labels)) is not None:
+            yield best
+            return
         proven = yield from self.maps(labels, "opt", BETTERING)
         if not proven:
             yield from self.maps(labels, "opt", options=["--opt-strategy=usc"])
@@ -348,3 +410,9 @@ class PlacesAndPaths:
         reader = facts.PathReader(control, self._task.trace, self._task.theory, self.named.chart, labels)
         answers = self._asker.answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
         return (yield from mapped(lambda answer: Found.of(reader.map_of(answer).without_headings(), self._task.theory), answers))
+
+
+def _go_on_at_home(control: Control, homes: Mapping[int, list[int]], parts: Iterable[str]) -> None:
+    """Ground the other parts of a control that has what segments tell, where each place is at one of its homes."""
+    control.add("homes", [], facts.tight_facts(homes))
+    control.ground([(part, []) for part in ("homes", *(part for part in parts if part not in TOLD))])

@@ -117,9 +117,9 @@ class Paths:
         control.load_encodings("preference")
         nodes = range(len(labels)) if nodes is None else nodes
         control.add("base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single))
-        control.ground([("base", []), *([("again", [])] if single else []), ("least", [])])
+        control.ground([("base", []), *([("again", [])] if single else []), ("segments", []), ("least", [])])
         if self._pinned and not single:
-            control.add("pinned", [], facts.pinned_facts(_pairwise_distinct(*facts.read_rivals(control))))
+            control.add("pinned", [], facts.pinned_facts(pairwise_distinct(*facts.read_rivals(control))))
         control.ground([("pinned", []), ("paths", []), ("each", [])])
         return control
 
@@ -241,13 +241,13 @@ class Paths:
         return of_first(len(places))
 
 
-def _pairwise_distinct(segments: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
-    """As many segments as are soon found no two of which can be one path, as these pairs cannot."""
-    number = {segment: i for i, segment in enumerate(segments)}
-    rivals = np.zeros((len(segments), len(segments)), dtype=bool)
+def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
+    """As many members as are soon found no two of which can be one, as these pairs cannot. They are segments, or places."""
+    number = {member: i for i, member in enumerate(members)}
+    rivals = np.zeros((len(members), len(members)), dtype=bool)
     for g, h in pairs:
         rivals[number[g], number[h]] = True
-    return [segments[i] for i in large_clique(rivals)]
+    return [members[i] for i in large_clique(rivals)]
 
 
 def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:

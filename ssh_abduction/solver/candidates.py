@@ -18,7 +18,7 @@ from ssh_abduction.logs import log_of
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
-from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.theory.speedups import Speedups, row
 
 _log = log_of(__name__)
 
@@ -62,6 +62,27 @@ class Candidates:
                     attempt()
                 if seconds < math.inf and attempt is not surest and self._known.best is not before:
                     return
+
+    def sketch_least(self) -> bool:
+        """Offer a sketch that has as few dstates as steps of the trace are pairwise apart, so that no map has fewer. Says whether there is one.
+
+        Where the robot drives there and back, and most views are different, that is so. Then only places and paths remain to be found.
+        """
+        from ssh_abduction.steps.apart import Continuations  # loads numpy
+
+        trace, theory, log = self._task.trace, self._task.theory, self._task.log
+        if not self._task.speedups.greedy or not row("clique").holds_for(theory) or unchecked(theory):
+            return False
+        apart: int | None = None
+        for sketch in Sketch.all_of(trace.steps[0], theory):
+            if not all(sketch.extend(action, step) for action, step in each_looking(zip(trace.actions, trace.steps[1:], strict=True))):
+                continue
+            ssh_map = sketch.map()
+            apart = apart or len(Continuations(log.seen, log.actions).clique())
+            if len(ssh_map.dstates) == apart:
+                self.offer(ssh_map)
+                return self._known.best is not None and len(self._known.best.dstates) == apart
+        return False
 
     def _attempts(self) -> list[Callable[[], None]]:
         """The ways to make a map without a search. Those that make small maps come first."""

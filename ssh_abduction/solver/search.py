@@ -78,6 +78,7 @@ from ssh_abduction.words import counted
 FEW_STEPS = 24  # Traces up to this length skip names and greedy maps: solving them directly is faster.
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.
 ONE_MORE_SHARE = 0.1  # Or for such a share of the time that these took, if that is more, so that it is never a large part of the search.
+SETTLE_AFTER = 0.15  # After so many seconds step by step it is looked whether the dstates are known without a search: to look loads numpy.
 FRAME_AFTER = 1.0  # After so many seconds step by step a map with frames is sought, where the theory does not ask for one: most traces are solved by then.
 READABLE = 60  # Traces up to so many steps are given to the readable encodings, which know places and faults; longer ones would take more memory than there is.
 SHORTEST = 0.05  # A trace that was mended has so many seconds at least.
@@ -375,7 +376,9 @@ class Search:
         takes_all = isinstance(engine, StepEngine) and not self._goes_on and FEW_STEPS < steps <= AT_ONCE
         may_frame = takes_all and self._task.speedups.framing
         may_settle = takes_all and self._task.speedups.ways and self._asked_speedups.names
-        if (may_frame or may_settle) and not self._find_minimum_soon(FRAME_AFTER):
+        if may_settle and not self._find_minimum_soon(min(SETTLE_AFTER, FRAME_AFTER)) and self._candidates.sketch_least():
+            self._settle_dstates_first()
+        elif (may_frame or may_settle) and self.status is Status.UNKNOWN and not self._find_minimum_soon(FRAME_AFTER):
             _log.info("no minimum after %.1f s step by step", self._watch.elapsed())
             if may_frame:
                 _log.info("maps in which places have frames are sought as candidates")
