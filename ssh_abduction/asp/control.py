@@ -87,8 +87,18 @@ class Control(clingo.Control):
         self.seconds = self.mebibytes = 0.0
         self._check = check
 
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """No other control reads or grounds meanwhile. While one does, this waits, and looks whether to go on."""
+        while not _grounding.acquire(timeout=POLL):
+            self._check()
+        try:
+            yield
+        finally:
+            _grounding.release()
+
     def load(self, path: str) -> None:
-        with _grounding:
+        with self._alone():
             super().load(path)
 
     def load_encodings(self, *names: str) -> None:
@@ -98,13 +108,15 @@ class Control(clingo.Control):
                 self.load(path)
 
     def add(self, *program: Any) -> None:
-        with _grounding:
+        with self._alone():
             super().add(*program)
 
     def ground(self, parts: Sequence[tuple[str, Sequence[clingo.Symbol]]] = (("base", ()),), context: Any = None) -> None:
         asked = _Asked(self._check)
-        while not _grounding.acquire(timeout=POLL):
-            self._check()
+        with self._alone():
+            self._ground_alone(parts, context, asked)
+
+    def _ground_alone(self, parts: Sequence[tuple[str, Sequence[clingo.Symbol]]], context: Any, asked: _Asked) -> None:
         began, before = time.perf_counter(), peak_memory()
         try:
             super().ground(parts, context or asked)
@@ -113,7 +125,6 @@ class Control(clingo.Control):
                 raise asked.raised from None
             raise
         finally:
-            _grounding.release()
             seconds, mebibytes = time.perf_counter() - began, peak_memory() - before
             self.seconds += seconds
             self.mebibytes += mebibytes

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 
 import clingo
@@ -99,6 +99,18 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
                     f"write {parameter} = {atom.arguments[-1]}, not {name}(…,{parameter}), in the body"
                 )
     _check_safety(rules)
+
+
+def read_by(rules: Rules, every: Iterable[Rules]) -> frozenset[str]:
+    """The predicates that rules read and that none of these files defines.
+
+    Args:
+        rules: The rules, which `check_rules` found to be in order.
+        every: All files of rules.
+    """
+    own = {name for other in every for statement, _, _ in _statements(other) for name in _heads(statement)}
+    of_rules = [statement for statement, _, _ in _statements(rules) if statement.ast_type is ast.ASTType.Rule]
+    return frozenset(atom.name for statement in of_rules for atom, _ in _atoms(statement) if atom.name not in own)
 
 
 def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:

@@ -12,8 +12,8 @@ from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.clock import each_looking, heeding
 from ssh_abduction.engines.base import Found, Task
+from ssh_abduction.guesses.gated import gated_map
 from ssh_abduction.guesses.tree import Sketch
-from ssh_abduction.judge.checker import unchecked
 from ssh_abduction.logs import log_of
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.judging import Judging
@@ -52,12 +52,12 @@ class Candidates:
             seconds: What it may take. Each sketch may use a share of what is left.
         """
         with self._sketching:
-            if self._known.best is not None or not self._task.speedups.greedy or unchecked(self._task.theory):
+            if self._known.best is not None or not self._task.speedups.greedy or not self._judging.can_accept:
                 return
             whole = Watch().part(seconds)
             *smaller, surest = self._attempts()
-            for share, attempt in ((1.0, surest), *((SKETCH_SHARE, attempt) for attempt in smaller)):
-                before = self._known.best
+            for attempt in (surest, *smaller):
+                before, share = self._known.best, 1.0 if attempt in (surest, smaller[-1]) else SKETCH_SHARE
                 with suppress(LimitError), heeding(whole.part(share * whole.left()).check):
                     attempt()
                 if seconds < math.inf and attempt is not surest and self._known.best is not before:
@@ -71,7 +71,7 @@ class Candidates:
         from ssh_abduction.steps.apart import Continuations  # loads numpy
 
         trace, theory, log = self._task.trace, self._task.theory, self._task.log
-        if not self._task.speedups.greedy or not row("clique").holds_for(theory) or unchecked(theory):
+        if not self._task.speedups.greedy or not row("clique").holds_for(theory) or not self._judging.can_accept:
             return False
         apart: int | None = None
         for sketch in Sketch.all_of(trace.steps[0], theory):
@@ -87,10 +87,18 @@ class Candidates:
     def _attempts(self) -> list[Callable[[], None]]:
         """The ways to make a map without a search. Those that make small maps come first."""
         known, trace, theory = self._known.partial, self._task.trace, self._task.theory
+        if theory.star == "gateways":
+            return [partial(self._offer_gated, homing=homing) for homing in (True, False)]
         sketches = Sketch.all_of(trace.steps[0], theory)
         if known is not None:
             sketches.insert(0, Sketch.beyond(known, trace.prefix(len(known.labels)), theory))
         return [self.merge, *(partial(self._go_on_to_end, sketch) for sketch in sketches)]
+
+    def _offer_gated(self, *, homing: bool) -> None:
+        """Offer a map whose places have gateways at any angles, if one is made at once."""
+        ssh_map = gated_map(self._task.trace, self._task.theory, homing=homing, pairs=self._task.log.pairs)
+        if ssh_map is not None:
+            self.offer(ssh_map)
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
         """Offer a sketch that goes on to the end of the trace, if the trace does not contradict it before."""

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import random
 import time
+from functools import cached_property
 
+from ssh_abduction.asp.own import can_be_asked, keeps_own_rules
 from ssh_abduction.errors import SSHError
-from ssh_abduction.judge.checker import Violation, check, unchecked, violations
+from ssh_abduction.judge.checker import AXIOMS, Violation, check, unchecked, violations
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.evidence import Equality, evidence_of
 from ssh_abduction.theory.theory import Theory
@@ -75,10 +77,21 @@ class Judging:
         self._trace = trace
         return not any(evidence.refuse(trace, ssh_map, since) for evidence in self._evidence)
 
+    @cached_property
+    def can_accept(self) -> bool:
+        """Whether all that the theory asks for can be judged of a map: by the checker, and for own rules by clingo, which grounds them with the map."""
+        own = {axiom.name for rules in self._theory.rules for axiom in rules.axioms} | {rules.name for rules in self._theory.rules}
+        others = unchecked(self._theory.replace(rules=()))
+        return not others and own.isdisjoint(AXIOMS) and can_be_asked(self._theory)
+
     def accepts(self, ssh_map: SSHMap) -> bool:
         """Whether a map of the whole trace that nothing proves yet is known to satisfy all axioms."""
-        breaks = next(violations(self._trace, ssh_map, self._theory), None)
-        accepted = not unchecked(self._theory) and breaks is None and not self.why_refused(ssh_map)
+        accepted = (
+            self.can_accept
+            and next(violations(self._trace, ssh_map, self._theory), None) is None
+            and not self.why_refused(ssh_map)
+            and keeps_own_rules(self._trace, ssh_map, self._theory)
+        )
         self._accepted = ssh_map if accepted else self._accepted
         return accepted
 

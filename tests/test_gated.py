@@ -1,0 +1,139 @@
+"""Maps without a search where stars are at any angles, and where there are rules of one's own."""
+
+from __future__ import annotations
+
+import random
+from unittest.mock import patch
+
+import networkx as nx
+import planar
+import pytest
+
+from benchmarks.instances import maze
+from ssh_abduction import Status, Theory, Trace, solve
+from ssh_abduction.asp.own import can_be_asked, keeps_own_rules
+from ssh_abduction.guesses.gated import gated_map
+from ssh_abduction.judge.checker import check
+from ssh_abduction.maps import SSHMap
+from ssh_abduction.solver import search as solver
+from ssh_abduction.theory.pairs import Pairs
+from ssh_abduction.theory.rules import Rules
+
+WORLDS: dict[str, nx.Graph] = {
+    "triangle": planar.triangle(),
+    "hexagon": planar.hexagon(),
+    "junction of 5": planar.junction(0, 72, 144, 216, 288),
+    "junction of 6": planar.junction(0, 60, 120, 180, 240, 300),
+    "dead ends": planar.junction(0, 140),
+    "triangles": planar.triangles(2, 2),
+    "any angles": planar.scattered(6, random.Random(0)),
+}
+
+
+def drive(world: str, seed: int, steps: int = 24) -> Trace:
+    graph = WORLDS[world]
+    start = next(iter(graph))
+    trace: Trace = planar.drive(graph, start, next(iter(graph[start])), steps, random.Random(seed), noise=8).trace
+    return trace
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("homing", [True, False])
+def test_what_grows_by_stars_is_a_map(world: str, homing: bool) -> None:
+    for seed in range(2):
+        trace = drive(world, seed)
+        theory = Theory.topological().resolve(trace)
+        assert theory.star == "gateways"
+        ssh_map = gated_map(trace, theory, homing=homing)
+        assert ssh_map is not None
+        assert check(trace, ssh_map, theory) == ()
+
+
+@pytest.mark.parametrize("world", ["junction of 5", "any angles"])
+def test_there_is_a_map_of_stars_at_any_angles_when_the_time_is_over(world: str) -> None:
+    trace = drive(world, 0, 40)
+    with patch.multiple(solver, OVERTIME=100.0):
+        solution = solve(trace, limit=1e-6)
+    assert solution.status is Status.FEASIBLE
+    assert check(trace, solution.maps[0], solution.theory) == ()
+    assert len(solution.maps[0].dstates) < len(trace)  # known places are tried, too
+
+
+def test_evidence_keeps_a_place_from_being_taken_for_another() -> None:
+    trace = Trace.from_steps("aba", ["travel", "around"], stars=[[0, 120], [180], [0]])
+    back = Trace.from_steps("abaa", ["travel", "around", "travel"], stars=[[0, 120], [180], [0], [180, 300]])
+    theory = Theory.topological().resolve(back)
+    there = gated_map(back, theory, homing=True)
+    assert there is not None
+    assert there.dstates[there.labels[3]].place == there.dstates[there.labels[0]].place
+    away = gated_map(back, theory, homing=True, pairs=Pairs.of((), [(0, 3)]))
+    assert away is None or away.dstates[away.labels[3]].place != away.dstates[away.labels[0]].place
+    assert gated_map(trace, theory, homing=False) is not None
+
+
+KEPT = {
+    "brief": "% @axiom(brief) No dstate is seen again much later.\n#program step(t).\nviolation(brief,t) :- same(I,t), t-I > 60.",
+    "a constraint": "#program step(t).\n:- same_place(0,t), t > 90.",
+    "at the end": "% @axiom(few) Few paths.\n#program check(t).\nviolation(few,t) :- query(t), along(_,900,_).",
+    "a choice": "{ lit }.\n#program step(t).\n:- not lit, same(_,t).",
+    "order": "% @axiom(order) x\n#program step(t).\nviolation(order,t) :- before(H,P,P), at(t,P).",
+}
+BROKEN = {
+    "all steps": "% @axiom(never) x\n#program step(t).\nviolation(never,t) :- view(t,_).",
+    "at the end": "% @axiom(many) x\n#program check(t).\nviolation(many,t) :- query(t), along(_,1,pos).",
+    "a place": "#program step(t).\n:- at(t,P), P > 0.",
+    "a course": "#program step(t).\n:- same_course(_,t).",
+}
+
+
+def ruled(text: str, theory: Theory) -> Theory:
+    return theory.replace(rules=[Rules("own.lp", text)])
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_there_is_a_map_with_own_rules_when_the_time_is_over(name: str) -> None:
+    trace = maze(3, 3, steps=60, seed=0).trace
+    theory = ruled(KEPT[name], Theory.topological())
+    with patch.multiple(solver, OVERTIME=100.0):
+        solution = solve(trace, theory, limit=1e-6)
+    assert solution.status is Status.FEASIBLE
+    assert check(trace, solution.maps[0], Theory.topological()) == ()
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_no_map_is_given_that_breaks_own_rules(name: str) -> None:
+    trace = maze(3, 3, steps=60, seed=0).trace
+    with patch.multiple(solver, OVERTIME=100.0):
+        assert solve(trace, ruled(BROKEN[name], Theory.topological()), limit=1e-6).maps == ()
+
+
+SMALL = Trace.from_steps("abab", ["travel", "around", "travel"])
+READ = [
+    "same(I,t), t-I > 1",
+    "same_place(I,t), not same(I,t)",
+    "along(t,1,neg)",
+    "at(t,0), t > 1",
+    "on(1,P), at(t,P), view(t,b)",
+    "before(1,P,Q), at(t,Q), P > Q",
+    "travel(t-1), same_course(t-1,t), t > 2",
+    "on_some_path(t), turn(t-1,around)",
+]
+
+
+@pytest.mark.parametrize(("level", "body"), [("causal", READ[0]), *(("topological", body) for body in READ)])
+def test_rules_are_kept_by_those_maps_that_clingo_lists(body: str, level: str) -> None:
+    """Of all maps without the rule, those keep it that clingo finds with it."""
+    plain = getattr(Theory, level)().replace(prefer=())
+    theory = ruled(f"#program step(t).\n:- {body}.", plain)
+
+    def maps_of(asked: Theory) -> set[SSHMap]:
+        return set(solve(SMALL, asked, maps=0).maps)
+
+    resolved = theory.resolve(SMALL)
+    assert can_be_asked(resolved)
+    assert {ssh_map for ssh_map in maps_of(plain) if keeps_own_rules(SMALL, ssh_map, resolved)} == maps_of(theory)
+
+
+@pytest.mark.parametrize("body", ["founded(S,t)", "used(H,t)", "violation(deterministic,t)"])
+def test_rules_that_read_what_a_map_does_not_show_are_not_asked(body: str) -> None:
+    assert not can_be_asked(ruled(f"#program step(t).\n:- {body}.", Theory.topological()).resolve(SMALL))
