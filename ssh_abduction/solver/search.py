@@ -84,7 +84,7 @@ READABLE = 60  # Traces up to so many steps are given to the readable encodings,
 SHORTEST = 0.05  # A trace that was mended has so many seconds at least.
 # To make some map where a search was stopped without one, or to check it, may take so many seconds beyond the limit, and such a share of it.
 OVERTIME, OVERTIME_SHARE = 0.5, 0.05
-INTERRUPTED = 1.0  # Or so many seconds after Ctrl-C, or where memory is over.
+INTERRUPTED = 0.6  # Or so many seconds after Ctrl-C, or where memory is over.
 REASONING = 5.0  # For so many seconds it is sought what all minimal maps share, where the search took less and has no time limit.
 ALL = Speedups()
 _log = log_of(__name__)
