@@ -34,6 +34,9 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "--relations", metavar="FILE", help="judge by hand-checked relative poses, too: lines of time1 time2 x y z roll pitch yaw"
     )
+    parser.add_argument(
+        "--truth", metavar="FILE", help="judge by the robot's true trajectory, in TUM format: lines of timestamp tx ty tz qx qy qz qw"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
     parser.epilog = (
@@ -43,7 +46,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.evaluation import Relations, evaluate, evaluate_visits, tells_names, told_poses  # which load scipy
+    from ssh_abduction.evaluation import Relations, Trajectory, evaluate, evaluate_visits, tells_names, told_poses  # which load scipy
     from ssh_abduction.evaluation.visits import NEAR
 
     data = read_maps(options.maps)
@@ -51,12 +54,14 @@ def run(options: argparse.Namespace) -> int:
     if not maps:
         raise MapError(f"{options.maps}: maps: expected one to evaluate, got none; see the status that solve printed")
     trace = Trace.load(options.trace)
+    if options.truth is not None:
+        trace = Trajectory.load(options.truth).told_to(trace)
     relations = None if options.relations is None else Relations.load(options.relations)
     near = NEAR if options.near is None else options.near
     named_truth = tells_names(trace)
     found, judged = None, []
     try:
-        if options.near is not None or (not named_truth and any(told_poses(trace))):
+        if options.near is not None or options.truth is not None or (not named_truth and any(told_poses(trace))):
             judged.append(evaluate_visits(maps, trace, near=near))
         if relations is not None:
             judged.append(evaluate_visits(maps, trace, near=near, relations=relations))
@@ -65,6 +70,8 @@ def run(options: argparse.Namespace) -> int:
     except MapError as error:
         raise MapError(f"{named(options.maps)}: {error}") from None
     for visits in judged:
+        if not visits.places.judged:
+            print(f"ssh-abduction: warning: {_nothing_judged(visits)}", file=sys.stderr)
         if visits.by_both is not None and visits.by_both[1] < ALIKE * visits.by_both[0]:
             print(
                 f"ssh-abduction: warning: relations and the poses of the trace judge {visits.by_both[1]} of {counted(visits.by_both[0], 'pairs')} of visits alike: "
@@ -84,6 +91,18 @@ def run(options: argparse.Namespace) -> int:
         print(_told_of_visits(visits))
         print(table(PAIRS, [[i, *_pairs(one.places), *_pairs(one.dstates)] for i, one in enumerate(visits.maps, 1)]))
     return 0
+
+
+def _nothing_judged(found: VisitsEvaluation) -> str:
+    """Why no pair of visits was judged, so that no figure says anything."""
+    why = f"the trace has {counted(found.visits, 'visits')}"
+    if found.places.stayed:
+        why += f"; of {counted(found.places.stayed, 'pairs')} within {found.near:g} m the robot was at no visit farther away in between"
+    if found.places.unknown:
+        why += f"; of {counted(found.places.unknown, 'pairs')} {found.judge} do not tell how far apart they are"
+    return (
+        f"judged by {found.judge}: expected pairs of visits to judge, got none: {why}; evaluate a longer drive, or with truth at more steps"
+    )
 
 
 def _told_of_visits(found: VisitsEvaluation) -> str:

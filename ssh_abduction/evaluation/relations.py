@@ -28,6 +28,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from simulator.motion import Pose, between, moved
 from ssh_abduction.errors import TraceError, brief, named
+from ssh_abduction.evaluation.trajectory import is_trajectory
 from ssh_abduction.files import read_at_most
 from ssh_abduction.odometry import Displacement
 
@@ -75,11 +76,13 @@ class Relations:
             text = read_at_most(path, LARGEST).decode("utf-8")
         except ValueError as error:  # bytes that are no text are one, too
             raise TraceError(f"{named(path)}: expected a text of relations, got another file ({error}); give one of numbers") from None
-        found = []
-        for number, line in enumerate(text.splitlines(), 1):
-            fields = line.partition("#")[0].split()
-            if fields:
-                found.append(_relation(fields, f"{named(path)}:{number}"))
+        lines = [(number, fields) for number, line in enumerate(text.splitlines(), 1) if (fields := line.partition("#")[0].split())]
+        if is_trajectory(fields for _, fields in lines):
+            raise TraceError(
+                f"{named(path)}: expected relations, {' '.join(FIELDS)}, got a trajectory: each line ends in a quaternion; "
+                f"give it as the truth of the steps (--truth)"
+            )
+        found = [_relation(fields, f"{named(path)}:{number}") for number, fields in lines]
         if not found:
             raise TraceError(f"{named(path)}: expected lines of {' '.join(FIELDS)}, got none; give a file of relations")
         return Relations(found)

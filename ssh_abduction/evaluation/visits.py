@@ -34,6 +34,7 @@ from ssh_abduction.checks import an_instance
 from ssh_abduction.errors import TraceError, brief, is_finite, named
 from ssh_abduction.evaluation.names import checked_map
 from ssh_abduction.evaluation.relations import Relations
+from ssh_abduction.evaluation.trajectory import checked_pose, checked_time
 from ssh_abduction.maps import SSHMap, checked_maps
 from ssh_abduction.trace import Trace, checked_trace
 from ssh_abduction.words import counted
@@ -230,8 +231,8 @@ class _Related:
 
     def __init__(self, trace: Trace, relations: Relations) -> None:
         self._relations = relations
-        self._times = [_time(step.extra.get("time"), trace.at(t)) for t, step in enumerate(trace.steps)]
-        self._seen = [_pose(step.extra.get("seen"), f"{trace.at(t)}: seen") or (0.0, 0.0, 0.0) for t, step in enumerate(trace.steps)]
+        self._times = [checked_time(step.extra.get("time"), trace.at(t)) for t, step in enumerate(trace.steps)]
+        self._seen = [checked_pose(step.extra.get("seen"), trace.at(t)) for t, step in enumerate(trace.steps)]
         self.told = np.array([relations.covers(time) for time in self._times])
         if not self.told.any():
             began, ended = relations.times[0], relations.times[-1]
@@ -251,13 +252,6 @@ class _Related:
             ]
         ).T
         return np.hypot(dx, dy), _degrees(turned), DOUBT + DOUBT_OF_WAY * way
-
-
-def _time(value: Any, where: str) -> float | None:
-    """The time of a step in seconds. Raises TraceError."""
-    if value is not None and not is_finite(value):
-        raise TraceError(f"{where}: time: expected seconds, got {brief(value)}; mend it, or leave it out")
-    return None if value is None else float(value)
 
 
 def _degrees(radians: Array) -> Array:
