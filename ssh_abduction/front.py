@@ -45,15 +45,20 @@ class Point:
 
 @dataclass(frozen=True)
 class Front:
-    """The points for 0, 1, 2, … faults, as far as time allowed."""
+    """The points for 0, 1, 2, … faults, as far as time allowed. There is none for numbers of faults that what somebody asserts rules out.
+
+    points   what so many faults are worth
+    stopped  whether the time limit ended the search
+    """
 
     points: tuple[Point, ...]
+    stopped: bool = False
 
     @property
     def knee(self) -> int | None:
         """The number of faults at which the number of dstates stops falling fast: where it fell most more than it falls next. None where it never does, or where nothing is proven."""
-        counts = [point.dstates for point in self.points if point.proven]
-        bends = {k: (counts[k - 1] - counts[k]) - (counts[k] - counts[k + 1]) for k in range(1, len(counts) - 1)}
+        counts = self._proven
+        bends = {k: (counts[k - 1] - counts[k]) - (counts[k] - counts[k + 1]) for k in counts if k - 1 in counts and k + 1 in counts}
         knee = max(bends, key=lambda k: bends[k], default=None)
         return knee if knee is not None and bends[knee] > 0 else None
 
@@ -62,11 +67,16 @@ class Front:
         """What a fault must cost, in dstates, for the map at the knee to be minimal among those of the front: more than the first number, and less than the second. None without such a price."""
         if self.knee is None:
             return None
-        counts = [point.dstates for point in self.points if point.proven]
+        counts = self._proven
         here = counts[self.knee]
-        least = max((here - count) / (k - self.knee) for k, count in enumerate(counts) if k > self.knee)
-        most = min((count - here) / (self.knee - k) for k, count in enumerate(counts) if k < self.knee)
+        least = max((here - count) / (k - self.knee) for k, count in counts.items() if k > self.knee)
+        most = min((count - here) / (self.knee - k) for k, count in counts.items() if k < self.knee)
         return (least, most) if least < most else None
+
+    @property
+    def _proven(self) -> dict[int, int]:
+        """The number of dstates for each number of faults for which it is proven."""
+        return {point.faults: point.dstates for point in self.points if point.proven}
 
 
 def fault_front(trace: Trace, theory: Theory | None = None, most: int = 5, limit: float | None = None) -> Front:
@@ -75,7 +85,7 @@ def fault_front(trace: Trace, theory: Theory | None = None, most: int = 5, limit
     theory  Theory.causal() by default; its prices say which kinds of faults there are, both where it has none
     limit   seconds in all
 
-    Raises TheoryError where the theory has places: their axioms are not known to the engine that counts faults.
+    Raises TheoryError where the theory has places, whose axioms are not known to the engine that counts faults, and where it asserts something of steps that the trace does not have.
     """
     theory = Theory.causal() if theory is None else checked_theory(theory)
     check_limit("limit", "seconds", limit)
@@ -87,10 +97,12 @@ def fault_front(trace: Trace, theory: Theory | None = None, most: int = 5, limit
         raise TheoryError("front: expected the causal axioms alone, fewest dstates first; leave out --rules, --without and --prefer")
     if not is_whole(most) or not 0 <= most <= 1000:
         raise TheoryError(f"front: expected a number of faults from 0 to 1000, got {brief(most)}")
-    theory = (theory if theory.has_faults else theory.replace(**KINDS)).resolve(checked_trace(trace))
+    theory.check_steps(checked_trace(trace))
+    theory = (theory if theory.has_faults else theory.replace(**KINDS)).resolve(trace)
     watch = Watch(limit)
     watch.start()
-    return Front(tuple(_points(Task.of(trace, theory, watch), most)))
+    points = tuple(_points(Task.of(trace, theory, watch), most))
+    return Front(points, stopped=any(not point.proven for point in points))
 
 
 def _points(task: Task, most: int) -> Iterator[Point]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import random
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import accumulate, pairwise, product
 from pathlib import Path
@@ -290,15 +291,64 @@ def test_the_front_is_what_brute_force_finds() -> None:
             assert check(trace, point.map, Theory.causal().replace(**kinds)) == ()
 
 
-def fewest(trace: Trace, faults: int, kinds: set[str]) -> int:
-    """The fewest dstates with so many faults, by trying all labels."""
+@pytest.mark.parametrize("seed", range(12))
+def test_the_front_of_what_is_asserted_is_what_brute_force_finds(seed: int) -> None:
+    rng = random.Random(seed)
+    steps = rng.randint(3, 5)
+    trace = Trace.from_steps([rng.choice("abc") for _ in range(steps)], [rng.choice(["right", "travel"]) for _ in range(steps - 1)])
+    same, different = (tuple(sorted(rng.sample(range(steps), 2))) for _ in range(2))
+    theory = Theory.causal().replace(same=[same], different=[different] if rng.random() < 0.6 else [])
+    expected = [fewest(trace, faults, {"misread", "slipped"}, theory.same, theory.different) for faults in range(4)]
+    front = fault_front(trace, theory, most=3)
+    assert {point.faults: point.dstates for point in front.points} == {k: count for k, count in enumerate(expected) if count is not None}
+    assert not front.stopped
+    for point in front.points:
+        assert point.map is not None
+        assert check(trace, point.map, theory.replace(misread=1.5, slipped=1.5)) == ()
+
+
+def test_a_dstate_whose_views_are_all_misread_has_a_view() -> None:
+    trace = Trace.from_steps([3, 0, 0, 0, 0], ["travel", "right", "travel", "right"],
+        displacements=[(7.9, -0.8, 0.0), (-0.0, 0.0, -1.6), (17.4, 0.6, -0.2), (0.0, -0.0, -0.8)])  # fmt: skip
+    front = fault_front(trace, most=2)
+    assert [point.dstates for point in front.points] == [5, 5, 5]
+    assert all(set(point.map.labels) == set(range(5)) for point in front.points if point.map)
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        (["--same", "0,9"], 1, r"same \(--same\): expected steps from 0 to 3, got 0,9"),
+        (["--different", "0,9"], 1, "different"),
+        (["--same", "0,1"], 20, "no map has at most 0 faults: what is asserted .* contradicts"),
+        (["--same", "0,1", "--json"], 20, r'"front": \[\]'),
+    ],
+)
+def test_a_front_without_points_says_why(
+    options: list[str], code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = str(tmp_path / "trace.jsonl")
+    Trace.from_steps("abca", ["right", "travel", "left"]).save(path)
+    assert main(["solve", path, "--front", "0", *options]) == code
+    assert re.search(said, "".join(capsys.readouterr()))
+    if code == 20 and "--json" not in options:  # a view that is misread mends it
+        assert main(["solve", path, "--front", "1", *options]) == 0
+        assert "no map has fewer than 1 fault, as something is asserted" in capsys.readouterr().out
+
+
+def fewest(
+    trace: Trace, faults: int, kinds: set[str], same: Iterable[tuple[int, int]] = (), different: Iterable[tuple[int, int]] = ()
+) -> int | None:
+    """The fewest dstates with so many faults, by trying all labels; None where there are none."""
     counts = []
     for labels in partitions(len(trace)):
+        if any(labels[i] != labels[j] for i, j in same) or any(labels[i] == labels[j] for i, j in different):
+            continue
         views, ends = votes(trace, labels)
         wrong, slips = (sum(sum(c.values()) - max(c.values()) for c in found.values()) for found in (views, ends))
         if (not wrong or "misread" in kinds) and (not slips or "slipped" in kinds) and wrong + slips <= faults:
             counts.append(len(views))
-    return min(counts)
+    return min(counts, default=None)
 
 
 def test_the_front_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ import argparse
 from ssh_abduction import program
 from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.outcome import dump
-from ssh_abduction.cli.text import table
+from ssh_abduction.cli.text import counted, table
 from ssh_abduction.errors import SSHError
 from ssh_abduction.front import Front, fault_front
 from ssh_abduction.theory.theory import Theory
@@ -15,15 +15,20 @@ from ssh_abduction.trace import Trace
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the front. Exit code 0 if all of it is proven, else 10, as for solve."""
+    """Print the front. Exit code 0 if all of it is proven, 20 if it is proven that there is no map, and else 10, as for solve."""
     if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
         raise SSHError("--front: expected one trace, got several, or --jobs or --scheduler; ask for each trace by itself")
     front = fault_front(Trace.load(options.traces[0]), theory_of(options, Theory.causal()), options.front, options.time_limit)
     print(dump(_as_data(front)) if options.json else _as_text(front, options.front))
-    return 0 if len(front.points) == options.front + 1 and all(point.proven for point in front.points) else 10
+    return 10 if front.stopped else 0 if front.points else 20
 
 
 def _as_text(front: Front, most: int) -> str:
+    if not front.points:
+        return (
+            f"no map has at most {counted(most, 'faults')}: what is asserted (--same, --different, --elsewhere) contradicts what was seen and done; "
+            f"allow more faults (--front), or assert less"
+        )
     rows = []
     for point in front.points:
         faults = "; ".join(map(str, point.map.faults)) if point.map else "–"
@@ -34,11 +39,13 @@ def _as_text(front: Front, most: int) -> str:
         lines.append(
             f"a fault that costs more than {front.prices[0]:g} and less than {front.prices[1]:g} dstates makes the map at the knee minimal among these"
         )
-    elif len(front.points) > most:
+    elif not front.stopped:
         lines.append("no knee: each further fault saves about as many dstates")
-    if len(front.points) <= most:
+    if front.stopped:
         why = "interrupted" if program.raised else "stopped by the time limit"
         lines.append(f"{why} at {front.points[-1].faults} faults")
+    if first := front.points[0].faults:
+        lines.append(f"no map has fewer than {counted(first, 'faults')}, as something is asserted")
     return "\n".join(lines)
 
 

@@ -342,7 +342,14 @@ class FaultyEngine:
     def _found(self, labels: Sequence[int], slips: Collection[int], number: Mapping[int, int], shows: Sequence[int] | None = None) -> Found:
         """A map of the whole trace, and what it costs."""
         view_of = dict(facts.faulty_names(self._names))
-        shown = shows or [view_of[name] for name in number]
+        shown = self._shown_somewhere(labels, shows or [view_of[name] for name in number])
         misread = [t for t in range(self.size) if shown[labels[t]] != self._seen[t]]
         faults = [*((t, "misread") for t in misread), *((t, "slipped") for t in slips)]
         return Found.of(facts.faulty_map(labels, self._task.trace, faults, self._task.theory), self._task.theory)
+
+    def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
+        """The views of dstates, so that each is read right at some step: of one that never is, any other view is as good, and the one seen most often needs fewer faults."""
+        views = list(shown)
+        for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:
+            views[s] = Counter(self._seen[t] for t, label in enumerate(labels) if label == s).most_common(1)[0][0]
+        return views
