@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -314,6 +315,75 @@ def test_rules_that_could_never_be_read_say_how_to_write_them(
     with pytest.raises(TheoryError, match=message) as error:
         solve(Trace.from_steps("aa", ["travel"]), rules=["own.lp"])
     assert "\n" not in str(error.value)
+
+
+SOUND = "% @axiom(near) No step is seen again soon.\n#program step(t).\nviolation(near,t) :- same(I,t), t-I > 10.\n"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\xef\xbb\xbf" + SOUND.encode(),
+        SOUND.replace("\n", "\r\n").encode(),
+        SOUND.replace("\n", "\r").encode(),
+        SOUND.replace("soon", "bientôt, “là”").encode(),
+        f'{SOUND}%* é %* nested *% “ *%\nown("é\\"”"). % é'.encode(),
+    ],
+)
+def test_rules_of_any_editor_are_read(data: bytes, tmp_path: Path) -> None:
+    (tmp_path / "own.lp").write_bytes(data)
+    theory = Theory.causal().replace(rules=[tmp_path / "own.lp"])
+    assert [axiom.name for axiom in theory.rules[0].axioms] == ["near"]
+    assert len(solve(Trace.from_steps("abab", ["travel"] * 3), theory).maps[0].dstates) == 2
+    apart = Trace.from_steps("a" + "b" * 11 + "a", ["travel"] * 12, displacements=[(1, 0, 0)] * 12)
+    assert solve(apart, theory, displacement="none").maps[0].labels[-1] != 0  # so the rule is read, and no part of a comment
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ("#program step(t).\n:- same(I,t), t-I > é.", r"own\.lp:2:21: expected ASCII outside of quotes and comments, got 'é' \(U\+00E9\); put it in quotes"),
+        ("%* a\n% *%\n*% é.", r"own\.lp:3:4: expected ASCII"),
+        ("a(“x”).", r"own\.lp:1:3: expected ASCII .*U\+201C"),
+        ("a.\u00a0b.", r"own\.lp:1:3: expected ASCII .*U\+00A0"),
+        ('a("é', r"own\.lp:1:4: expected ASCII"),
+        ('a("é\n").', r"own\.lp:1:4: expected ASCII"),
+        ('a("\\é").', r"own\.lp:1:5: expected ASCII"),
+        ("a.\ufeff", r"own\.lp:1:3: expected ASCII .*U\+FEFF"),
+        ("a.\0:- b.", r"own\.lp:1:3: expected ASCII .*U\+0000\); save it as UTF-8"),
+        ("% \0", r"own\.lp:1:3: expected ASCII"),
+        ("#script (lua) % #end ” ", r"own\.lp:1: expected rules, got #script"),
+        (SOUND.encode("utf-16"), "cannot be read: no text in UTF-8; save it as UTF-8"),
+        (SOUND.encode("utf-16-le"), r"own\.lp:1:2: expected ASCII .*U\+0000"),
+        ("% é".encode("latin-1"), "cannot be read: no text in UTF-8; save it as UTF-8"),
+    ],
+)  # fmt: skip
+def test_characters_that_end_clingo_are_refused(
+    data: str | bytes, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Clingo aborts the process over them, or reads no further."""
+    path, trace = tmp_path / "own.lp", tmp_path / "trace.jsonl"
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
+    Trace.from_steps("aa", ["travel"]).save(trace)
+    solve(Trace.from_steps("aa", ["travel"])).maps[0].save(tmp_path / "map.json")
+    known = str(tmp_path / "map.json")
+    for verb, *maps in (["solve"], ["explain"], ["ladder"], ["next", known], ["check", known]):
+        assert main([verb, str(trace), *maps, "--rules", str(path)]) == 1
+        assert re.search(message, capsys.readouterr().err)
+    with pytest.raises(TheoryError, match=message):
+        Theory.causal().replace(rules=[path])
+    if isinstance(data, str):
+        with pytest.raises(TheoryError, match=message):
+            Rules("own.lp", data)
+
+
+def test_what_is_no_text_is_no_rules() -> None:
+    with pytest.raises(TheoryError, match="half a character"):
+        Rules("own.lp", 'a("\ud800").')
+    with pytest.raises(TheoryError, match="expected a name and a text"):
+        Rules("own.lp", b"a.")  # type: ignore[arg-type]
+    with pytest.raises(TheoryError, match=r"a\\1\.lp:1:\d"):
+        solve(Trace.from_steps("aa", ["travel"]), rules=[Rules("a\\1.lp", "a :- b(.")])
 
 
 @pytest.mark.parametrize(("text", "where"), [("#program step(t).\n:- same(I,t), X > 3.", "b.lp:2"), ("#const n = 2.", "b.lp:1")])

@@ -140,7 +140,7 @@ def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
 def _said(rules: Rules, messages: list[str]) -> str:
     """What clingo said of rules, on one line."""
     said = " ".join(messages[0].split()) if messages else "clingo cannot read them"
-    said = re.sub(r"^<[^>]*>", rules.name, said)
+    said = re.sub(r"^<[^>]*>", lambda _: rules.name, said)
     return (
         f"{said if said.startswith(rules.name) else f'{rules.name}: {said}'}; rules are written as in: {' '.join(EXAMPLE.split(chr(10)))}"
     )
