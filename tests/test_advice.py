@@ -31,6 +31,7 @@ SAID_BY = {
     "ssh_abduction/cli/next_experiment.py": ("next",),
     "ssh_abduction/cli/options.py": (*WITH_MAP, *WITH_THEORY),
     "ssh_abduction/cli/text.py": ("solve", "compare"),
+    "ssh_abduction/evaluation": ("evaluate",),
     "ssh_abduction/explain.py": WITH_THEORY,
     "ssh_abduction/front.py": ("solve",),
     "ssh_abduction/log_report.py": ("map",),

@@ -232,7 +232,7 @@ def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.Captur
 
 
 def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_alone(hall: Path, tmp_path: Path) -> None:
-    question = MapQuestion(None, {}, (None, None, None), None, None, None, 1000.0, 1, False)
+    question = MapQuestion(None, {}, {}, None, None, None, 1000.0, 1, False)
     small = tmp_path / "small.log"
     small.write_text("\n".join(hall.read_text().splitlines()[:160]) + "\n")
     (answer,) = batch.here(question, [str(small)], 2, batch.Stop())

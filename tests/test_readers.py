@@ -419,7 +419,7 @@ def test_odometry_of_a_bag_is_that_at_the_times_of_the_scans(tmp_path: Path) -> 
     scan = log.scans[0]
     assert np.isnan(scan.ranges[0])
     assert scan.ranges[1:].tolist() == [1, 2, math.inf, math.inf]
-    assert scan.laser == Laser(-1.0, 0.5, 5, 8.0, START)
+    assert scan.laser == Laser(-1.0, 0.5, 5, 8.0, START, float(np.float32(0.1)))
     assert "No transform leads" in " ".join(log.notes)
 
 

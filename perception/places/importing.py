@@ -17,6 +17,7 @@ import numpy as np
 
 from perception.errors import ImageWarning, LogError
 from perception.places import jumps
+from perception.places.agreement import disagreement
 from perception.places.doors import are_frequent, find_doors, is_wide, visits_of
 from perception.places.scale import Scale, suggested
 from perception.places.tracing import to_trace
@@ -26,7 +27,10 @@ from perception.readers.scans import RobotLog
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
 from ssh_abduction.errors import named
+from ssh_abduction.logs import log_of
 from ssh_abduction.trace import Trace
+
+_log = log_of("ssh_abduction.perception.places")
 
 # A view is to be seen so many times in the mean, at least: of few images of many places most views would be seen once, and tell nothing.
 SEEN = 12
@@ -113,7 +117,12 @@ def tracked(log: RobotLog) -> tuple[RobotLog, Track, tuple[str, ...]]:
     log, alternating = jumps.of_one_source(log)
     log, counted = in_metres(log)
     track = follow(log)
-    return log, track, (*alternating, *counted, *jumps.said_of(log, track, turned_wrongly(log, track)))
+    notes = alternating + counted + jumps.said_of(log, track, turned_wrongly(log, track))
+    # An odometry that is wrong throughout explains each difference between both ways.
+    notes += jumps.said_of_whole(log) or [doubt for doubt in [disagreement(log, track)] if doubt]
+    for note in notes:
+        _log.warning("%s: %s", named(log.source), note)
+    return log, track, tuple(notes)
 
 
 def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:

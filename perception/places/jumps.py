@@ -80,7 +80,7 @@ def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan
 
 
 def said_of(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> list[str]:
-    """What is to be said of where a track is cut or broken, and of times that run back.
+    """What is to be said of where a track is cut or broken.
 
     Args:
         log: The log that was followed.
@@ -114,8 +114,14 @@ def said_of(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> lis
     if turned:
         first, angle = turned[0]
         notes.append(
-            f"Scans turn otherwise than the odometry, {_times(len(turned))}: at scan {first} ({_where(log, first)}) by {abs(math.degrees(angle)):.0f} degrees. The scans are believed."
+            f"Scans turn otherwise than the odometry, {_times(len(turned))}: at scan {first} ({_where(log, first)}) by {abs(math.degrees(angle)):.0f} degrees. The track turns as the scans do."
         )
+    return notes
+
+
+def said_of_whole(log: RobotLog) -> list[str]:
+    """What is to be said of an odometry that is wrong throughout, or of a log that is not in order."""
+    notes = []
     far_apart, to_and_fro = usual_step(log), float(_far(log, 2).sum() / max(2 * _far(log, 1).sum(), 1e-9))
     if far_apart > LONG:
         notes.append(

@@ -24,6 +24,8 @@ MOST = 30
 SHARE = 0.75
 # A place is looked at from its middle to so many corridor widths away: beyond the mouths of its gateways, and not as far as the next place.
 RADII = 3.2
+# That is so many metres at least and at most. It is also no farther than the laser reaches: whether a way leads on there, nothing tells.
+RADIUS = (3.0, 8.0)
 
 
 @dataclass(frozen=True)
@@ -67,10 +69,11 @@ def suggested(scans: Sequence[Scan], track: Track) -> Scale:
             patch = maps.around(i, track.poses[i, :2], ASIDE + 1)
             left = np.array([-ahead[1], ahead[0]]) / length
             widths.append(float(patch.free_along(track.poses[i, :2], np.stack([left, -left]), ASIDE).sum()))
+    reach = float(np.median([scan.laser.reach for scan in scans]))
     narrow, corridor, most = np.percentile(widths, [NARROW, CORRIDOR, MOST]) if widths else (1.2, 1.7, 1.7)
     return Scale(
         gateway=round(float(np.clip(SHARE * narrow, 0.5, 2.0)), 2),
-        radius=round(float(np.clip(RADII * corridor, 3.0, 8.0)), 2),
+        radius=round(float(np.clip(RADII * corridor, RADIUS[0], np.clip(reach, *RADIUS))), 2),
         most=round(float(most), 2),
     )
 

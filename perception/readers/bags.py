@@ -167,7 +167,8 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Readin
         notes.append(f"Scans are those of {said}. There are no messages Odometry: odometry is the transform from {odom} to {base}.")
         called = f"the transforms from {odom} to {base}"
     odometer = _of_one_source(odometer, called, notes)
-    mounts = {frame: _mount(frames, odom, base, frame, notes) for frame in seen}
+    assumed: dict[str, str] = {}
+    mounts = {frame: _mount(frames, odom, base, frame, notes, assumed) for frame in seen}
     if len(seen) > 1:
         notes.append(
             f"The scans are of several frames ({', '.join(f'{count} of {name}' for name, count in seen.most_common())}): each is mounted as its own frame says."
@@ -180,7 +181,7 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Readin
     if above:
         notes.append(f"Corrected poses are those of the transforms above {odom}.")
     where = _Where(Poses.of(odometer, by_stamp), [Poses.of(track, by_stamp) for track in above], mounts, by_stamp)
-    return Reading(bag.format, tuple(notes), _scans(bag, set(scans), where, damaged))
+    return Reading(bag.format, tuple(notes), _scans(bag, set(scans), where, damaged), assumed)
 
 
 def _scan_topics(bag: Bag, named: Sequence[str]) -> list[str]:
@@ -339,7 +340,7 @@ def _ancestors(frames: _Frames, frame: str) -> list[str]:
     return chain
 
 
-def _mount(frames: _Frames, odom: str, base: str, frame: str, notes: list[str]) -> tuple[Pose, bool]:
+def _mount(frames: _Frames, odom: str, base: str, frame: str, notes: list[str], assumed: dict[str, str]) -> tuple[Pose, bool]:
     """The laser's pose in the frame of the robot, and whether it hangs upside down."""
     if base == frame:
         return (0.0, 0.0, 0.0), False
@@ -347,8 +348,9 @@ def _mount(frames: _Frames, odom: str, base: str, frame: str, notes: list[str]) 
     parents = [_parent(frames, child).parent for child in chain]
     top = parents.index(base) if base in parents else parents.index(odom) - 1 if odom in parents else None
     if top is None:
-        notes.append(
-            f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser ({frame}): the laser is taken to sit in the robot's middle and to look ahead."
+        assumed["mount"] = (f"{assumed['mount']} " if "mount" in assumed else "") + (
+            f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser ({frame}): the laser is taken to sit in the robot's middle and to look ahead. "
+            "If it does not, say where it sits: --mount X,Y,DEGREES."
         )
         return (0.0, 0.0, 0.0), False
     translation, rotation = np.zeros(3), np.eye(3)
@@ -422,16 +424,12 @@ def _measured(message: Any, mount: Pose, is_flipped: bool) -> tuple[NDArray[np.f
         raise _Damaged(f"expected a first angle and a step in radians, got {first:g} and {step:g}")
     if is_flipped:
         first, step = -first, -step
-    laser = _laser(first, step, len(ranges), reach if reach > 0 else math.inf, mount)
-    with np.errstate(invalid="ignore"):
-        ranges[ranges >= laser.reach] = np.inf
-        ranges[(ranges < nearest) | (ranges <= 0)] = np.nan
-    return ranges, laser
+    return ranges, _laser(first, step, len(ranges), reach if reach > 0 else math.inf, mount, nearest if 0 < nearest < math.inf else 0.0)
 
 
 @lru_cache(maxsize=64)
-def _laser(first: float, step: float, beams: int, reach: float, mount: Pose) -> Laser:
-    return Laser(first, step, beams, reach, mount)
+def _laser(first: float, step: float, beams: int, reach: float, mount: Pose, nearest: float) -> Laser:
+    return Laser(first, step, beams, reach, mount, nearest)
 
 
 def _flat(position: Any, orientation: Any) -> Pose:

@@ -78,6 +78,8 @@ SICK_REACH, SICK_MOST = 81.83, 81.92
 NO_RANGE = 1000.0
 # Lines of CARMEN that say nothing here.
 OTHERS = (b"SYNC", b"RLASER", b"ROBOTLASER2", b"RAWLASER2", *(kind.encode() for kind in KINDS))
+# So many beams of a FLASER cover half a circle, by custom: those of a SICK at 2, 1, 1/2 and 1/4 degree, with the last one or without.
+HALF_A_CIRCLE = (90, 91, 180, 181, 360, 361, 720, 721)
 # So many scans wait at most for the next ODOM line.
 MOST_WAITING = 100
 
@@ -86,6 +88,7 @@ MOST_WAITING = 100
 class _Survey:
     """What the first way through a log finds of one kind of scans.
 
+    beams           of the first scan
     most, repeated  the largest range, and how often it came
     mount           the first pose in the frame of the second, at the first scan; it is about the same in so many scans (`mounted`), and far off in others (`wandered`)
     same            scans whose two poses are the same
@@ -96,6 +99,7 @@ class _Survey:
     """
 
     scans: int = 0
+    beams: int = 0
     most: float = 0.0
     repeated: int = 0
     mount: Pose | None = None
@@ -148,10 +152,15 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
     is_corrected = meaning != "edges" or found.graph.is_corrected(CORRECTED)
     if not is_corrected:
         notes.append("The poses of the vertices have not been corrected: they are the chain of the edges.")
+    assumed: dict[str, str] = {}
     mount = _mount(found, survey, meaning, kind)
-    reach = _reach(found, survey, kind, notes)
+    reach = _reach(found, survey, kind, assumed)
+    if kind == "FLASER" and "fov" not in found.parameters and survey.beams not in HALF_A_CIRCLE:
+        assumed["fov"] = (
+            f"The log does not say how wide the laser looks: its {survey.beams} beams are taken to cover 180 degrees. If they cover more or less, say so: --fov DEGREES."
+        )
     items = _scans(file, source, _Odometer(found, meaning, is_corrected), kind, mount, reach)
-    return Reading("g2o" if found.graph.vertices else "carmen", tuple(notes), items)
+    return Reading("g2o" if found.graph.vertices else "carmen", tuple(notes), items, assumed)
 
 
 def _meaning(found: _Found, survey: _Survey, kind: str, source: str, notes: list[str]) -> Meaning:
@@ -216,14 +225,14 @@ def _mount(found: _Found, survey: _Survey, meaning: Meaning, kind: str) -> Pose:
     return parameters.get("offset", 0.0), parameters.get("side", 0.0), parameters.get("angle", 0.0)
 
 
-def _reach(found: _Found, survey: _Survey, kind: str, notes: list[str]) -> float:
+def _reach(found: _Found, survey: _Survey, kind: str, assumed: dict[str, str]) -> float:
     """The range that says that nothing was near; infinite where the lines of the scans say it themselves."""
     if kind != "FLASER":
         return math.inf
     if (reach := found.parameters.get("reach", 0.0)) > 0:
         return reach
     reach = _without_codes(survey.most if survey.repeated > 2 or survey.most > SICK_REACH else math.ceil(survey.most))
-    notes.append(
+    assumed["no_return"] = (
         f"The log does not say how far the laser reaches. By its largest range, {survey.most:g} m, which came {survey.repeated} times, it is {reach:g} m."
     )
     return reach
@@ -283,6 +292,7 @@ def _count_restart(survey: _Survey, line: ScanLine, before: tuple[Pose, float | 
 
 def _count(survey: _Survey, line: ScanLine) -> None:
     survey.scans += 1
+    survey.beams = survey.beams or len(line.ranges)
     ranges = line.ranges[line.ranges <= NO_RANGE]
     most = float(ranges.max(initial=0.0))
     if most > survey.most:
@@ -419,11 +429,7 @@ def _measured(line: ScanLine, mount: Pose, reach: float, fov: float) -> tuple[ND
     else:
         first, step, reach = line.shape
         laser = _described(first, step, _without_codes(reach), beams, mount)
-    ranges = line.ranges
-    with np.errstate(invalid="ignore"):
-        ranges[ranges >= laser.reach] = np.inf
-        ranges[ranges <= 0] = np.nan
-    return ranges, laser
+    return line.ranges, laser
 
 
 def _without_codes(reach: float) -> float:

@@ -10,9 +10,14 @@ from typing import IO
 
 from perception.errors import LogError
 from perception.readers import bag_files, bags, carmen
+from perception.readers.echoes import Told, as_told, understood
 from perception.readers.lines import LONGEST_LINE, lines, opened
 from perception.readers.scans import Damage, Reading, RobotLog, Scan
 from ssh_abduction.errors import brief, named
+from ssh_abduction.logs import log_of
+from ssh_abduction.odometry import Pose
+
+_log = log_of("ssh_abduction.perception.readers")
 
 # The formats of logs, and what each is.
 LINES = {
@@ -26,15 +31,25 @@ HEAD = 2**16
 
 
 def read_log(
-    path: str | os.PathLike[str], format: str | None = None, *, scan_topic: str | Sequence[str] | None = None, odom_topic: str | None = None
+    path: str | os.PathLike[str],
+    format: str | None = None,
+    *,
+    scan_topic: str | Sequence[str] | None = None,
+    odom_topic: str | None = None,
+    fov: float | None = None,
+    mount: Pose | None = None,
+    no_return: float | None = None,
+    zero_is: str | None = None,
 ) -> RobotLog:
     """A robot's log.
 
     format                  one of FORMATS; where it is None it is guessed from what the file holds, never from its name
     scan_topic, odom_topic  the topics of a bag that are to be read, where it has several of scans or of odometry. Scans may be those of several topics, in a sequence
+    fov, mount, no_return, zero_is  what the log does not say of the laser, or says wrongly, as in `perception.readers.echoes.Told`
 
-    A damaged part is skipped, and stands in the log's `damaged`. Raises LogError where the file cannot be read, is of no known format, or holds no scan or no odometry.
+    What the reader assumed or found out stands in the log's `notes`. A damaged part is skipped, and stands in the log's `damaged`. Raises LogError where the file cannot be read, is of no known format, or holds no scan or no odometry.
     """
+    told = Told(fov, mount, no_return, zero_is)
     with _reading(path, format, scan_topic, odom_topic) as reading:
         scans: list[Scan] = []
         damaged: list[Damage] = []
@@ -47,15 +62,33 @@ def read_log(
         raise LogError(
             f"{named(path)}: expected scans, got none that can be read; {len(damaged)} are damaged, first: {damaged[0].what if damaged else 'none'}"
         )
-    return RobotLog(tuple(scans), tuple(damaged), reading.format, os.fspath(path), reading.notes)
+    meant, found_out = understood(scans, told)
+    assumed = (note for option, note in reading.assumed.items() if getattr(told, option) is None)
+    log = RobotLog(meant, tuple(damaged), reading.format, os.fspath(path), (*reading.notes, *assumed, *found_out))
+    for warning in log.warnings:
+        _log.warning("%s: %s", named(path), warning)
+    return log
 
 
 def stream_log(
-    path: str | os.PathLike[str], format: str | None = None, *, scan_topic: str | Sequence[str] | None = None, odom_topic: str | None = None
+    path: str | os.PathLike[str],
+    format: str | None = None,
+    *,
+    scan_topic: str | Sequence[str] | None = None,
+    odom_topic: str | None = None,
+    fov: float | None = None,
+    mount: Pose | None = None,
+    no_return: float | None = None,
+    zero_is: str | None = None,
 ) -> Iterator[Scan | Damage]:
-    """The scans of a robot's log one after another, and what was skipped, in the order of the file. Arguments and errors as for `read_log`."""
+    """The scans of a robot's log one after another, and what was skipped, in the order of the file. Arguments and errors as for `read_log`.
+
+    What only the whole log can tell is not found out: a range that repeats is a wall unless `no_return` says otherwise, and zeros are unknown unless `zero_is` does.
+    """
+    told = Told(fov, mount, no_return, zero_is)
     with _reading(path, format, scan_topic, odom_topic) as reading:
-        yield from reading.items
+        for item in reading.items:
+            yield as_told(item, told) if isinstance(item, Scan) else item
 
 
 @contextmanager

@@ -72,7 +72,7 @@ def scan_line(tokens: list[bytes]) -> ScanLine | None:
     else:
         if len(tokens) < 9:
             raise Damaged(f"expected at least 8 values after {kind}, got {len(tokens) - 1}")
-        start, step, reach = number_of(tokens[2]), number_of(tokens[4]), number_of(tokens[5])
+        start, step, reach = number_of(tokens[2]), number_of(tokens[4]), number_of(tokens[5], may_be_infinite=True)
         if not 0 < abs(step) <= math.tau or abs(start) > 2 * math.tau:
             raise Damaged(f"expected a start and a step in radians, got {start:g} and {step:g}")
         shape = start, step, reach if reach > 0 else math.inf
@@ -135,9 +135,9 @@ def time_at(tokens: list[bytes], at: int) -> float | None:
     return time if math.isfinite(time) else None
 
 
-def number_of(word: bytes) -> float:
-    """A finite number. Raises Damaged."""
-    if not _is_number(word) or not math.isfinite(value := float(word)):
+def number_of(word: bytes, may_be_infinite: bool = False) -> float:
+    """A finite number, or any that is written as one. Raises Damaged."""
+    if not _is_number(word) or not (math.isfinite(value := float(word)) or may_be_infinite):
         raise Damaged(f"expected a finite number, got {_quoted(word)}")
     return value
 

@@ -11,14 +11,15 @@ Angles are radians counterclockwise, lengths metres; a pose is (x, y, heading). 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.odometry import Pose
+from ssh_abduction.words import counted
 
 __all__ = ["Damage", "Laser", "Pose", "Reading", "RobotLog", "Scan"]
 
@@ -31,6 +32,7 @@ class Laser:
     beams        how many beams a scan has
     reach        metres beyond which a range says only that nothing was nearer
     mount        the pose of the scanner in the frame of the robot
+    nearest      metres up to which a range is no measurement
     """
 
     first: float
@@ -38,6 +40,15 @@ class Laser:
     beams: int
     reach: float
     mount: Pose = (0.0, 0.0, 0.0)
+    nearest: float = 0.0
+
+    @property
+    def steps(self) -> int:
+        """How many steps from beam to beam the field of view has.
+
+        A laser whose beams are even in number is taken to leave out the last one, as a SICK does and as scanners all around do.
+        """
+        return max(1, self.beams - self.beams % 2)
 
     @cached_property
     def bearings(self) -> NDArray[np.float64]:
@@ -96,14 +107,27 @@ class RobotLog:
     def __len__(self) -> int:
         return len(self.scans)
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The notes, and a sentence on the parts that were skipped."""
+        if not self.damaged:
+            return self.notes
+        first, were = self.damaged[0], "was" if len(self.damaged) == 1 else "were"
+        return (
+            *self.notes,
+            f"{counted(len(self.damaged), 'damaged parts')} of the log {were} skipped; the first is {first.line}: {first.what}",
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Reading:
     """A log whose format and meaning are known, and whose scans can now be read, once.
 
-    items  scans, and what was skipped, in the order of the file
+    items    scans with ranges as the driver wrote them, and what was skipped, in the order of the file
+    assumed  notes on what the log does not say and the reader assumed, by the field of `perception.readers.echoes.Told` that says it
     """
 
     format: str
     notes: tuple[str, ...]
     items: Iterator[Scan | Damage]
+    assumed: Mapping[str, str] = field(default_factory=dict)

@@ -207,7 +207,7 @@ class _Maker:
             angle_increment=laser.step,
             time_increment=0.0,
             scan_time=0.0,
-            range_min=0.0,
+            range_min=laser.nearest,
             range_max=laser.reach,
             ranges=np.asarray(ranges, dtype=np.float32),
             intensities=np.zeros(0, dtype=np.float32),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, add_output, write
 from ssh_abduction.cli.text import counted
@@ -19,6 +20,8 @@ FORMATS = ("carmen", "g2o", "ros1", "ros2", "mcap")
 PLACES = ("junctions", "doors")
 # What the name of a file ends in that says how it is packed, and then what is in it.
 ENDINGS = ("gz", "bz2", "xz", "zst", "zstd", "lz4"), ("log", "clf", "carmen", "txt", "g2o", "graph", "toro", "bag", "mcap", "db3")
+# Those of perception.readers.echoes.
+MEANINGS = ("free", "unknown")
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -46,6 +49,32 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         help="of a bag: the topic of the scans, where there are several; repeat it to read several lasers at once",
     )
     group.add_argument("--odom-topic", metavar="TOPIC", help="of a bag: the topic of the odometry, where there are several")
+    laser = parser.add_argument_group("the laser", "what the log does not say of it, or says wrongly")
+    laser.add_argument(
+        "--fov",
+        type=partial(_told, "fov"),
+        metavar="DEGREES",
+        help="the angle that the beams cover; negative for a laser that hangs upside down (default: as the log says, and 180 where it does not)",
+    )
+    laser.add_argument(
+        "--mount",
+        type=partial(_told, "mount"),
+        metavar="X,Y,DEGREES",
+        help="where the laser sits on the robot: metres ahead of its middle, metres to the left, and degrees to the left of straight ahead; "
+        "write --mount=X,Y,DEGREES where X is below 0 (default: as the log says, and 0,0,0 where it does not)",
+    )
+    laser.add_argument(
+        "--no-return",
+        type=partial(_told, "no_return"),
+        metavar="METRES",
+        help="ranges from here on mean that nothing came back (default: the laser's reach, or a range below it that repeats and is no wall)",
+    )
+    laser.add_argument(
+        "--zero-is",
+        choices=MEANINGS,
+        help="what a range of 0, below 0, below the laser's least range, or NaN means: nothing came back (free), or nothing is known (unknown) (default: free where the beams "
+        "beside them are long)",
+    )
     scale = parser.add_argument_group(
         "scale", "which ways out of a place count; the log itself suggests it by the passages that the robot drove through"
     )
@@ -73,7 +102,29 @@ def read(path: str, options: argparse.Namespace) -> RobotLog:
     """A log, as the options say. Raises SSHError."""
     from perception.readers.logs import read_log
 
-    return read_log(path, options.format, scan_topic=options.scan_topic, odom_topic=options.odom_topic)
+    return read_log(path, **reading_of(options))
+
+
+def reading_of(options: argparse.Namespace) -> dict[str, Any]:
+    """How a log is to be read, as arguments of `read_log`."""
+    return {name: getattr(options, name) for name in ("format", "scan_topic", "odom_topic", "fov", "mount", "no_return", "zero_is")}
+
+
+def _told(field: str, text: str) -> Any:
+    """What the user says of the laser, in a field of `Told`, which knows what it may be."""
+    from perception.readers.echoes import Told
+
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected numbers, got {text!r}") from None
+    value = numbers if field == "mount" or len(numbers) != 1 else numbers[0]
+    told: dict[str, Any] = {field: value}
+    try:
+        Told(**told)
+    except SSHError as error:
+        raise argparse.ArgumentTypeError(str(error).partition(": ")[2]) from None
+    return value
 
 
 def run(options: argparse.Namespace) -> int:
@@ -86,7 +137,7 @@ def run(options: argparse.Namespace) -> int:
         raise SSHError(f"{named(options.output)}: cannot write the trace: its folder is not there; make it first")
     doors = doors_of(options)
     log = read(options.log, options)
-    warn([*log.notes, *damage(log)])
+    warn(log.warnings)
     done = import_log(log, options.gateway, options.radius, named_after(options.log), doors)
     warn(done.notes)
     scale = done.scale
@@ -119,12 +170,3 @@ def named_after(path: str) -> str:
         if ending.lower() in endings and stem.strip("."):
             name = stem
     return name if name.strip(".") else "log"
-
-
-def damage(log: RobotLog) -> list[str]:
-    """What is to be said of the parts of a log that were skipped."""
-    if not log.damaged:
-        return []
-    first = log.damaged[0]
-    were = "was" if len(log.damaged) == 1 else "were"
-    return [f"{counted(len(log.damaged), 'damaged parts')} of the log {were} skipped; the first is {first.line}: {first.what}"]

@@ -26,7 +26,7 @@ from ssh_abduction.asp import workers
 from ssh_abduction.asp.limits import Stop, check_limit
 from ssh_abduction.cli import EXIT_ERROR, batch, unwritten
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.import_log import damage, doors_of, named_after
+from ssh_abduction.cli.import_log import doors_of, named_after, reading_of
 from ssh_abduction.cli.options import choices_of, theory_of
 from ssh_abduction.cli.outcome import exit_code, on_ctrl_c, warn
 from ssh_abduction.cli.text import counted
@@ -69,7 +69,7 @@ class MapQuestion:
 
     theory: Theory | None
     choices: dict[str, Any]
-    reading: tuple[str | None, list[str] | None, str | None]
+    reading: dict[str, Any]
     gateway: float | None
     radius: float | None
     doors: bool | None
@@ -85,7 +85,7 @@ class MapQuestion:
         return {
             "theory": theory,
             "choices": {name: laid_over[name] for name in self.choices},
-            "reading": list(self.reading),
+            "reading": self.reading,
             "gateway": self.gateway,
             "radius": self.radius,
             "doors": self.doors,
@@ -157,8 +157,7 @@ class MapQuestion:
                 from perception.readers.logs import read_log
                 from ssh_abduction.log_maps import LogMapping, map_log
 
-                log_format, scan_topic, odom_topic = self.reading
-                log = read_log(here, log_format, scan_topic=scan_topic, odom_topic=odom_topic)
+                log = read_log(here, **self.reading)
                 begun.append((log, LogMapping()))
                 done = map_log(
                     log,
@@ -191,7 +190,7 @@ class MapQuestion:
         total = sum(done.seconds.values())
         line = f"{named(path)}: {found}; {how}; {counted(len(done.imported.visits), 'visits')} in {counted(len(log), 'scans')}, {done.imported.track.way[-1]:.0f} m; {total:.1f} s"
         code = interrupted_code() if done.interrupted else exit_code(solution)
-        return MapAnswer(number, line, code, (*damage(log), *done.notes, *solution.warnings), tuple(files.items()))
+        return MapAnswer(number, line, code, (*log.warnings, *done.notes, *solution.warnings), tuple(files.items()))
 
     def _given_up(self, number: int, path: str) -> MapAnswer:
         """The answer for a log of which nothing is known when all is to stop."""
@@ -231,7 +230,7 @@ def run(options: argparse.Namespace) -> int:
     _check_folder(Path(options.output))
     question = MapQuestion(
         *_theory(options),
-        (options.format, options.scan_topic, options.odom_topic),
+        reading_of(options),
         options.gateway,
         options.radius,
         doors_of(options),
