@@ -147,7 +147,9 @@ def understood(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], tup
     meanings: dict[int, Meaning] = {}
     notes: list[str] = []
     for members in groups.values():
-        meaning, said = _surveyed(_apart([placed[i] for i in members]), told)
+        kept = moving(placed[i] for i in members)
+        some = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_SURVEYED)).astype(int))
+        meaning, said = _surveyed([kept[i] for i in some], told)
         meanings |= dict.fromkeys(members, meaning)
         notes += said
     return tuple(_measured(scan, meanings[i]) for i, scan in enumerate(placed)), tuple(dict.fromkeys(notes))
@@ -165,6 +167,16 @@ def as_told(scan: Scan, told: Told) -> Scan:
     """
     placed = told.placed(scan)
     return _measured(placed, Meaning(told.reach(placed.laser.reach), told.free))
+
+
+def moving(scans: Iterable[Scan]) -> list[Scan]:
+    """The scans before which the robot moved since the one before, by odometry."""
+    kept: list[Scan] = []
+    for scan in scans:
+        dx, dy, turned = between(kept[-1].odometry, scan.odometry) if kept else (APART, 0.0, 0.0)
+        if math.hypot(dx, dy) >= APART or abs(turned) >= TURNED:
+            kept.append(scan)
+    return kept
 
 
 def _measured(scan: Scan, meaning: Meaning) -> Scan:
@@ -186,16 +198,6 @@ def _kinds(scan: Scan) -> dict[str, Bools]:
         near = (ranges > 0) & (ranges <= scan.laser.nearest)
         found = ranges == 0, np.isnan(ranges), (ranges < 0) & np.isfinite(ranges), near
     return dict(zip(KINDS, found, strict=True))
-
-
-def _apart(scans: Iterable[Scan]) -> list[Scan]:
-    """Scans between which the robot moved."""
-    kept: list[Scan] = []
-    for scan in scans:
-        dx, dy, turned = between(kept[-1].odometry, scan.odometry) if kept else (APART, 0.0, 0.0)
-        if math.hypot(dx, dy) >= APART or abs(turned) >= TURNED:
-            kept.append(scan)
-    return [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_SURVEYED)).astype(int))]
 
 
 def _surveyed(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:

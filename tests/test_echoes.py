@@ -1,0 +1,254 @@
+"""What ranges mean that are no wall, and what is said if the way by scans is not the way by odometry."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.errors import LogError
+from perception.places.agreement import disagreement
+from perception.places.importing import tracked
+from perception.readers.echoes import MEANINGS, Array, Told, as_told, understood
+from perception.readers.logs import read_log
+from perception.readers.scans import RobotLog, Scan
+from perception.readers.writers import write_bag, write_carmen
+from simulator.tours import record
+from simulator.world import World
+from ssh_abduction.cli import main
+from ssh_abduction.cli.simulate import scans_of
+
+# Metres beyond which the lasers of these tests see nothing.
+SEES = 5.0
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[Scan, ...]:
+    """A drive around a corner of a hall, a scan each metre, with ranges as they truly are."""
+    return tuple(scans_of(record(World.named("taylor-hall"), every=1.0)))[:80]
+
+
+def written(scans: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float = 12.0, nearest: float = 0.0) -> list[Scan]:
+    """The scans of a laser that sees up to SEES, as a driver writes them.
+
+    Args:
+        scans: The scans with true ranges.
+        say: What the driver makes of the ranges, and of which of them are beyond SEES.
+        reach: How far the driver says that the laser reaches.
+        nearest: The least range that the driver says.
+    """
+    return [
+        replace(scan, ranges=say(scan.ranges.copy(), scan.ranges > SEES), laser=replace(scan.laser, reach=reach, nearest=nearest))
+        for scan in scans
+    ]
+
+
+def constant(value: float, noise: float = 0.0) -> Callable[[Array, Array], Array]:
+    """A driver that writes a constant where nothing came back."""
+    rng = np.random.default_rng(0)
+    return lambda ranges, beyond: np.where(beyond, value * (1 + noise * rng.uniform(-1, 1, len(ranges))), ranges)
+
+
+def with_rays_beyond(ranges: Array, beyond: Array) -> Array:
+    """A driver that writes 5.0, and now and then something farther."""
+    said = np.where(beyond, 5.0, ranges)
+    stray = np.flatnonzero(beyond)[::40]
+    said[stray] = ranges[stray]
+    return said
+
+
+@pytest.mark.parametrize(
+    ("say", "reach"),
+    [
+        (constant(5.0), 12.0),
+        (constant(5.0), math.inf),
+        (constant(5.09), 12.0),
+        (constant(8.0), 12.0),
+        (constant(float(np.float32(5.1))), 12.0),
+        (constant(5.05, noise=0.0005), 30.0),
+        (constant(5.2, noise=0.01), 12.0),
+        (with_rays_beyond, 12.0),
+    ],
+)
+def test_a_range_that_repeats_is_no_return(drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float) -> None:
+    scans, notes = understood(written(drive, say, reach), Told())
+    assert len(notes) == 1
+    assert re.search(r"Ranges of \d\.?\d* m repeat in \d+ % of the beams, and hardly any are longer.*--no-return", notes[0])
+    for scan, true in zip(scans, drive, strict=True):
+        assert np.array_equal(np.isinf(scan.ranges), true.ranges > SEES)
+
+
+@pytest.mark.parametrize(
+    ("say", "reach"),
+    [
+        (lambda ranges, _: np.minimum(ranges, 8.0), 8.0),  # the reach itself is no news
+        (lambda ranges, beyond: np.where(beyond, np.inf, ranges), 12.0),
+        (lambda ranges, _: ranges, 8.0),
+    ],
+)
+def test_walls_are_walls(drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float) -> None:
+    scans, notes = understood(written(drive, say, reach), Told())
+    assert notes == ()
+    for scan, true in zip(scans, drive, strict=True):
+        seen = np.isfinite(scan.ranges)
+        assert np.array_equal(scan.ranges[seen], true.ranges[seen])
+        assert (true.ranges[~seen] >= SEES).all()
+
+
+def test_a_robot_that_stands_before_a_wall_sees_no_range_that_repeats(drive: tuple[Scan, ...]) -> None:
+    flat = replace(drive[0], ranges=np.full(180, 2.0))
+    assert not any("repeat" in note for note in understood([flat] * 200, Told())[1])
+
+
+def test_a_reach_of_nothing_is_that_of_the_largest_range(drive: tuple[Scan, ...]) -> None:
+    scans, notes = understood(written(drive, lambda ranges, beyond: np.where(beyond, np.inf, ranges), math.inf), Told())
+    most = max(scan.ranges[scan.ranges <= SEES].max() for scan in drive)
+    assert re.search(rf"does not say how far the laser reaches.* it is {most:.4g} m", notes[0])
+    assert all(np.isfinite(scan.ranges[true.ranges <= SEES]).all() for scan, true in zip(scans, drive, strict=True))
+
+
+@pytest.mark.parametrize("value", [0.0, math.nan, -1.0, 0.05])
+def test_zeros_beside_long_beams_are_free(drive: tuple[Scan, ...], value: float) -> None:
+    scans, notes = understood(written(drive, constant(value), nearest=0.1), Told())
+    assert re.search(r"\d+ % of the beams are .*nothing came back.*--zero-is unknown", notes[0])
+    for scan, true in zip(scans, drive, strict=True):
+        assert np.array_equal(np.isinf(scan.ranges), true.ranges > SEES)
+
+
+@pytest.mark.parametrize("value", [0.0, math.nan])
+def test_zeros_at_random_are_unknown(drive: tuple[Scan, ...], value: float) -> None:
+    rng = np.random.default_rng(0)
+    scans, notes = understood(written(drive, lambda ranges, _: np.where(rng.random(len(ranges)) < 0.1, value, ranges)), Told())
+    (note,) = (note for note in notes if "of the beams are" in note)
+    assert re.search(r"\d+ % of the beams are .*nothing is known there.*--zero-is free", note)
+    assert all(np.isnan(scan.ranges).any() for scan in scans)
+
+
+@pytest.mark.parametrize("meaning", MEANINGS)
+def test_what_the_user_says_of_zeros_is_obeyed_in_silence(drive: tuple[Scan, ...], meaning: str) -> None:
+    told = Told(zero_is=meaning, no_return=11.0)
+    scans, notes = understood(written(drive, constant(0.0)), told)
+    assert notes == ()
+    is_meant = np.isinf if meaning == "free" else np.isnan
+    for scan, alone, true in zip(scans, (as_told(s, told) for s in written(drive, constant(0.0))), drive, strict=True):
+        assert is_meant(scan.ranges[true.ranges > SEES]).all()
+        assert np.array_equal(scan.ranges, alone.ranges, equal_nan=True)
+
+
+def test_ranges_from_no_return_on_are_none(drive: tuple[Scan, ...]) -> None:
+    scans, _ = understood(drive, Told(no_return=3.0))
+    assert all(np.array_equal(np.isinf(scan.ranges), true.ranges >= 3.0) for scan, true in zip(scans, drive, strict=True))
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"fov": 0}, {"fov": 361}, {"fov": math.nan}, {"fov": "180"}, {"mount": (1, 2)}, {"mount": (1, 2, math.inf)}, {"mount": (1000, 0, 0)},
+        {"mount": "0,0,0"}, {"no_return": 0}, {"no_return": -1}, {"no_return": math.inf}, {"zero_is": "wall"}, {"zero_is": 0},
+    ],
+)  # fmt: skip
+def test_nonsense_about_the_laser_is_refused(told: dict[str, object]) -> None:
+    with pytest.raises(LogError, match=f"{next(iter(told))}: expected .*, got .*; name"):
+        Told(**told)  # type: ignore[arg-type]
+
+
+def test_a_mount_for_several_lasers_is_refused(drive: tuple[Scan, ...]) -> None:
+    second = [replace(scan, laser=replace(scan.laser, mount=(0.0, 0.0, math.pi))) for scan in drive]
+    with pytest.raises(LogError, match="mount: expected the scans of one laser, got those of 2"):
+        understood([*drive, *second], Told(mount=(0, 0, 0)))
+
+
+def doubt(scans: tuple[Scan, ...]) -> str:
+    log = RobotLog(scans, source="drive")
+    log, track, notes = tracked(log)
+    assert sum("The way by scans" in note for note in notes) <= 1
+    return disagreement(log, track) or ""
+
+
+def test_a_good_drive_is_not_doubted(drive: tuple[Scan, ...]) -> None:
+    assert doubt(drive) == ""
+
+
+@pytest.mark.parametrize("fov", [120.0, 135.0, 240.0, 270.0])
+def test_a_wrong_field_of_view_is_said_with_the_likely_one(drive: tuple[Scan, ...], fov: float) -> None:
+    """The true one is 180 degrees."""
+    said = doubt(tuple(Told(fov=fov).placed(scan) for scan in drive))
+    (about,) = map(float, re.findall(rf"cover about (\d+) degrees, not {fov:.0f} \(--fov\)", said))
+    assert about == pytest.approx(180, abs=12)
+    assert re.search(r"\d+ m by scans, \d+ m by odometry; turns by scans are \d\.\d\d times", said)
+
+
+def test_a_laser_that_hangs_upside_down_is_said(drive: tuple[Scan, ...]) -> None:
+    assert "--fov 180" in doubt(tuple(Told(fov=-180).placed(scan) for scan in drive))
+
+
+@pytest.mark.parametrize("angle", [-150.0, -90.0, -30.0, 15.0, 60.0, 180.0])
+def test_a_wrong_mount_is_said_with_the_likely_one(drive: tuple[Scan, ...], angle: float) -> None:
+    """The laser truly looks ahead."""
+    said = doubt(tuple(Told(mount=(0, 0, angle)).placed(scan) for scan in drive))
+    (looks,) = map(float, re.findall(r"--mount=0,0,(-?\d+)\)", said))
+    assert abs(looks) <= 10
+
+
+def test_one_warning_is_enough_where_the_odometer_explains_it(drive: tuple[Scan, ...]) -> None:
+    """Odometry in a foreign unit, or none, explains that both ways differ."""
+    lost = tuple(replace(scan, odometry=(0.0, 0.0, 0.0)) for scan in drive)
+    _, _, notes = tracked(RobotLog(lost, source="drive"))
+    assert any("odometry is missing there" in note for note in notes)
+    assert not any("The way by scans" in note for note in notes)
+
+
+@pytest.mark.parametrize("verb", ["import", "map"])
+def test_both_verbs_show_all_notes_and_take_the_same_options(
+    drive: tuple[Scan, ...], verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "drive.bag"
+    write_bag(path, written(tuple(Told(fov=135).placed(scan) for scan in drive), constant(5.0)))
+    out = ["-o", str(tmp_path / "out"), *(["--no-ladder", "--time-limit", "5"] if verb == "map" else [])]
+    main([verb, str(path), *out])
+    said = capsys.readouterr().err
+    for note in ("Scans are those of", "Ranges of 5 m repeat", "The way by scans is not the way by odometry"):
+        assert said.count(f"warning: {note}") == 1
+    if verb == "map":
+        for file in ("run.json", "report.html"):
+            text = (tmp_path / "out" / file).read_text()
+            assert "Ranges of 5 m repeat" in text
+            assert "The way by scans is not" in text
+    else:
+        main([verb, str(path), *out, "--fov", "180", "--no-return", "5", "--mount=0,0,0", "--zero-is", "unknown"])
+        said = capsys.readouterr().err
+        assert "Scans are those of" in said
+        assert "repeat" not in said
+        assert "The way by scans" not in said
+
+
+def test_a_field_of_view_that_a_log_does_not_say_is_noted(drive: tuple[Scan, ...], tmp_path: Path) -> None:
+    """CARMEN's FLASER lines have no field of view; custom says that of 180 beams, and of 181, and not that of 150."""
+    for beams, is_noted in ((180, False), (150, True)):
+        path = tmp_path / "drive.log"
+        few = [replace(scan, ranges=scan.ranges[:beams], laser=replace(scan.laser, beams=beams)) for scan in drive]
+        lines = [
+            f"FLASER {beams} {' '.join(f'{min(r, 81.0):.2f}' for r in s.ranges)} 0 0 0 {' '.join(map(str, s.odometry))} {t} x {t}"
+            for t, s in enumerate(few)
+        ]
+        path.write_text("\n".join(lines) + "\n")
+        for told, here in ({}, is_noted), ({"fov": 150.0}, False):
+            assert any("--fov" in note for note in read_log(path, **told).notes) == here  # type: ignore[arg-type]
+    assert read_log(path, fov=90).scans[0].laser.step * 150 == pytest.approx(math.pi / 2)
+    write_carmen(path, drive)
+    assert not any("--fov" in note for note in read_log(path).notes)
+
+
+@pytest.mark.parametrize(
+    "words", [["--fov", "0"], ["--fov", "x"], ["--mount", "1,2"], ["--no-return", "-1"], ["--zero-is", "wall"], ["--mount=1,2,nan"]]
+)
+def test_nonsense_in_the_shell_is_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["import", "drive.log", *words])
+    assert end.value.code == 2
+    assert "expected" in (said := capsys.readouterr().err) or "invalid choice" in said
