@@ -112,6 +112,16 @@ LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = 
     "complete without proof": ({"status": "feasible"}, "complete: expected false, as the status is feasible, got true"),
     "complete, though stopped": ({"stopped": "maps limit"}, "complete: expected false, as the search was stopped ('maps limit'), got true"),
     "complete of another type": ({"complete": 1}, "complete: expected true or false, got 1"),
+    "a false id": (lambda d: d["maps"][1].update(id="000000000000"), "maps[1].id: expected "),
+    "an id of another type": (lambda d: d["maps"][1].update(id=7), "maps[1].id: expected "),
+    "the id of another map": (lambda d: d["maps"][1].update(id=d["maps"][0]["id"]), "maps[1].id: expected "),
+    "a false summary": ({"summary": "1 minimal map"}, "summary: expected '4 minimal maps: the same dstates; "),
+    "a summary of another type": ({"summary": [4]}, "summary: expected '4 minimal maps: the same dstates; "),
+    "a false backbone": (lambda d: d["backbone"]["places"].update(sometimes=[]), "backbone: expected the same dstates; "),
+    "a fit without displacements": (
+        lambda d: d["maps"][0].update(fit={"chi2": 1.0, "dof": 1, "p": 0.5, "scale": 0.0, "bend": 0.0}),
+        "maps[0].fit: expected none, as the trace has no displacements",
+    ),
     "optimal without a map": ({"maps": []}, "status: expected unsatisfiable or unknown, as there is no map, got optimal"),
 }
 
@@ -127,6 +137,20 @@ def test_a_lie_is_named(case: str, tmp_path: Path, capsys: pytest.CaptureFixture
     code, out = check(ACES, data, tmp_path, capsys)
     assert code == 20
     assert any(shown.startswith(line) for shown in out.splitlines()), out
+
+
+@pytest.mark.parametrize(("part", "value"), [("chi2", 0.0), ("dof", 0), ("p", 1.0), ("scale", 0.5), ("bend", -1.0)])
+def test_a_false_fit_is_named(part: str, value: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(tmp_path / "trace.jsonl")
+    moves = [(10, 0.3, 0.1), (0.1, 0, 1.5)] * 4
+    Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=moves).save(path)
+    data = answer(path, capsys, "--theory", "causal")
+    assert check(path, data, tmp_path, capsys)[0] == 0
+    assert data["maps"][0]["fit"][part] != pytest.approx(value, abs=0.01)
+    for change in ({"fit": data["maps"][0]["fit"] | {part: value}}, {"poses": [[0, 0, 0]] * len(data["maps"][0]["dstates"])}):
+        code, out = check(path, data | {"maps": [data["maps"][0] | change]}, tmp_path, capsys)
+        assert code == 20
+        assert f"maps[0].{next(iter(change))}: expected" in out
 
 
 def test_maps_that_are_not_equally_good_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

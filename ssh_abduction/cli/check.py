@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.text import counted
-from ssh_abduction.errors import MapError, printable
+from ssh_abduction.errors import MapError, brief, is_finite, printable
 from ssh_abduction.judge.checker import check, unchecked
 from ssh_abduction.judge.claims import false_claims
 from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.maps import SSHMap, maps_of, read_json
+from ssh_abduction.solver.ranking import Ranking
+from ssh_abduction.solver.result import Solution, summary_of
+from ssh_abduction.solver.sharing import Sharing
 from ssh_abduction.steps.certificate import RESTS_ON
 from ssh_abduction.theory.theory import Theory
 from ssh_abduction.trace import Trace
@@ -87,7 +91,8 @@ def _bound(trace: Trace, data: Any, theory: Theory, maps: Sequence[SSHMap], doub
     bound = check_bound(trace, data["certificate"])
     for fault in bound.faults:
         print(f"bound: {printable(fault)}")
-    false = false_claims(data, maps, len(trace), solved, bound.dstates + len(bound.refuted))
+    false = [*false_claims(data, maps, len(trace), solved, bound.dstates + len(bound.refuted)), *_false_of_maps(data, maps, trace)]
+    false += () if false else _false_of_all(data, trace)
     for claim in false:
         print(printable(claim))
     if bound.faults:
@@ -105,3 +110,46 @@ def _bound(trace: Trace, data: Any, theory: Theory, maps: Sequence[SSHMap], doub
         beyond = "fewer than that, so this bound or a map is wrong" if fewest < total else f"{fewest - total} more than proven"
         print(f"the maps have {fewest}" + (": no map has fewer" if fewest == total else f", {beyond}"))
     return not false and (fewest is None or fewest >= total)
+
+
+def _false_of_maps(data: Mapping[str, Any], maps: Sequence[SSHMap], trace: Trace) -> Iterator[str]:
+    """What the file says wrongly of single maps: their ids, and how well they close."""
+    ranking = Ranking(trace)
+    for i, (said, ssh_map) in enumerate(zip(data.get("maps", ()), maps, strict=False)):
+        if "id" in said and said["id"] != ssh_map.id:
+            yield f"maps[{i}].id: expected {ssh_map.id}, the digest of the map, got {brief(said['id'])}"
+        if ssh_map.fit is None and not {"fit", "poses", "spreads"} & set(said):
+            continue
+        if not trace.has_displacements:
+            yield f"maps[{i}].fit: expected none, as the trace has no displacements, got {brief(said.get('fit'))}"
+            continue
+        right = ranking.fitted(ssh_map).to_dict()
+        for name in ("fit", "poses", "spreads"):
+            if not _is_near(said.get(name), right[name]):
+                yield f"maps[{i}].{name}: expected {brief(right[name])}, by the displacements of the trace, got {brief(said.get(name))}"
+
+
+def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
+    """What the file says wrongly of what its maps share. Its other claims hold, so that it can be read as a solution."""
+    solution = Solution.from_dict(data, "the file", trace)
+    backbone = solution.backbone
+    if backbone and backbone.proven and solution.minimal_listed:
+        sharing = Sharing()
+        for ssh_map in solution.maps[: solution.levels[0].count] if solution.levels else solution.maps:
+            sharing.absorb(ssh_map)
+        right = sharing.backbone(proven=True)
+        if backbone.to_dict() != right.to_dict():
+            yield f"backbone: expected {right.sentence or 'the one map'}, as the maps show, got {backbone.sentence or 'something else'}"
+        backbone = right
+    summary = summary_of(solution, solution.count, backbone)
+    if data.get("summary", summary) != summary:
+        yield f"summary: expected {brief(summary)}, as the maps show, got {brief(data['summary'])}"
+
+
+def _is_near(said: Any, right: Any) -> bool:
+    """Whether numbers that are nested alike are about the same, as machines round differently."""
+    if isinstance(right, Mapping):
+        return isinstance(said, Mapping) and set(said) == set(right) and all(_is_near(said[k], right[k]) for k in right)
+    if isinstance(right, list):
+        return isinstance(said, list) and len(said) == len(right) and all(map(_is_near, said, right))
+    return is_finite(said) and math.isclose(said, right, rel_tol=0.01, abs_tol=0.01)
