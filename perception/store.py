@@ -97,7 +97,7 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     except OSError as error:
         raise PerceptionError(f"{path}: cannot write the recogniser: {error.strerror or error}; check the folder") from None
     except ValueError as error:
-        raise PerceptionError(f"output: cannot write the recogniser: {error}; name a file") from None
+        raise PerceptionError(f"{brief(str(path))}: cannot write the recogniser: {error}; name a file") from None
 
 
 def load(path: str | os.PathLike[str]) -> Stored:

@@ -9,6 +9,7 @@ import re
 import stat
 import threading
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,7 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> None:
     """Write a file, which appears whole or not at all, with the permissions of the file that it replaces.
 
     Nothing but a regular file is ever replaced: through a symbolic link its target is written, and a device or a pipe takes the bytes.
-    Raises OSError, and ValueError for a text that is no path.
+    Raises OSError, which names this file and no other, and ValueError for a text that is no path.
     """
     if not os.fspath(path):
         raise ValueError("expected the name of a file, got an empty text")
@@ -103,7 +104,10 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> None:
         mode = None
     target = Path(os.path.realpath(path))
     if mode is not None and not (stat.S_ISREG(mode) and target.exists() and target.samefile(path)):
-        Path(path).write_bytes(data)
+        try:
+            Path(path).write_bytes(data)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, os.fspath(path)) from None
         return
     draft = target.with_name(f".{os.getpid()}-{threading.get_ident():x}.part")  # short, as the target's name may be as long as names can be
     try:
@@ -111,8 +115,11 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> None:
         if mode is not None:
             draft.chmod(stat.S_IMODE(mode))
         draft.replace(target)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from None
     finally:
-        draft.unlink(missing_ok=True)
+        with suppress(OSError):  # where the folder is not there, or is a file
+            draft.unlink(missing_ok=True)
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from html import escape
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from perception.places.importing import Imported
 from perception.readers.scans import Pose, RobotLog
-from ssh_abduction.drawing import COLOURS, page, text
+from ssh_abduction.drawing import COLOURS, escaped, page, text
 from ssh_abduction.maps import SSHMap
 from ssh_abduction.odometry import between, moved
 from ssh_abduction.rungs import Rung
@@ -50,7 +49,7 @@ def report(log: RobotLog, imported: Imported, solution: Solution, rungs: Sequenc
     """
     name = imported.trace.name or "log"
     parts = [
-        f"<h1>{escape(name)}</h1>",
+        f"<h1>{escaped(name)}</h1>",
         *map(_paragraph, [_summary(solution, run), *run["notes"]]),
         _figure(log, imported, solution),
         "<h2>What each kind of evidence is worth</h2>" + _ladder(rungs) if rungs else "",
@@ -64,7 +63,7 @@ def report(log: RobotLog, imported: Imported, solution: Solution, rungs: Sequenc
     return (
         f'<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">"
-        f"<title>{escape(name)}</title><style>{STYLE}</style>\n" + "\n".join(part for part in parts if part) + "\n</html>\n"
+        f"<title>{escaped(name)}</title><style>{STYLE}</style>\n" + "\n".join(part for part in parts if part) + "\n</html>\n"
     )
 
 
@@ -203,7 +202,7 @@ def _log(log: RobotLog, run: Mapping[str, Any]) -> str:
     if log.damaged:
         said.append(f"Skipped: {counted(len(log.damaged), 'damaged parts')} of the log. The first ones:")
         said += [f"{damage.line}: {damage.what}" for damage in log.damaged[:10]]
-    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in said) + "</ul>"
+    return "<ul>" + "".join(f"<li>{escaped(line)}</li>" for line in said) + "</ul>"
 
 
 def _visits(imported: Imported, solution: Solution) -> str:
@@ -232,13 +231,13 @@ def _visits(imported: Imported, solution: Solution) -> str:
 
 
 def _table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
-    titles = "".join(f"<th>{escape(str(cell))}</th>" for cell in head)
-    body = "".join("<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    titles = "".join(f"<th>{escaped(str(cell))}</th>" for cell in head)
+    body = "".join("<tr>" + "".join(f"<td>{escaped(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><tr>{titles}</tr>{body}</table>"
 
 
 def _paragraph(told: str) -> str:
-    return f"<p>{escape(told)}</p>"
+    return f"<p>{escaped(told)}</p>"
 
 
 def _pose(row: Array) -> Pose:

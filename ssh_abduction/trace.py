@@ -500,7 +500,7 @@ class Trace:
         except OSError as error:
             raise TraceError(f"{named(path)}: cannot write the trace: {error.strerror or error}; check the folder") from None
         except ValueError as error:
-            raise TraceError(f"output: cannot write the trace: {error}; name a file") from None
+            raise TraceError(f"{brief(str(path))}: cannot write the trace: {error}; name a file") from None
 
     @property
     def digest(self) -> str:

@@ -223,7 +223,7 @@ def test_one_is_not_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_the_bound_of_an_answer_without_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str], solved: Path) -> None:
     bare = tmp_path / "bare.json"
-    none = {"maps": [], "count": 0, "cost": None, "status": "unknown", "complete": False}
+    none = {"maps": [], "count": 0, "cost": None, "status": "unknown", "complete": False, "summary": "no map was found", "backbone": None}
     bare.write_text(json.dumps({**json.loads(solved.read_text()), **none}))
     assert main(["check", "--bound", ACES, str(bare)]) == 0
     assert "at least 19 dstates, if clingo is right" in capsys.readouterr().out

@@ -207,7 +207,7 @@ def test_one_warning_is_enough_where_the_odometer_explains_it(drive: tuple[Scan,
 def test_both_verbs_show_all_notes_and_take_the_same_options(
     drive: tuple[Scan, ...], verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "drive.bag"
+    path = tmp_path / "dri\x1b[31mve.bag"  # a name that would colour a terminal
     write_bag(path, written(tuple(Told(fov=135).placed(scan) for scan in drive), constant(5.0)))
     out = ["-o", str(tmp_path / "out"), *(["--no-ladder", "--time-limit", "5"] if verb == "map" else [])]
     main([verb, str(path), *out])
@@ -219,6 +219,7 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
             text = (tmp_path / "out" / file).read_text()
             assert "Ranges of 5 m repeat" in text
             assert "The way by scans is not" in text
+            assert "\x1b" not in text
     else:
         main([verb, str(path), *out, "--fov", "180", "--no-return", "5", "--mount=0,0,0", "--zero-is", "unknown"])
         said = capsys.readouterr().err

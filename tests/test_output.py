@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import json
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from perception import store
 from perception.recognition import recogniser
 from ssh_abduction import SSHMap, Trace, solve
 from ssh_abduction.cli import main
+from ssh_abduction.errors import TraceError
 from ssh_abduction.files import write_file
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -224,7 +226,7 @@ def test_a_reproduction_writes_its_data_before_it_draws(
     assert main(["reproduce", "taylor-hall", "--seeds", "0", "--jobs", "1", "-o", str(tmp_path)]) == 1
     captured = capsys.readouterr()
     assert "1 of 1" in captured.out
-    assert captured.err == "ssh-abduction: output: cannot be written: No space left on device; make room\n"
+    assert captured.err == f"ssh-abduction: {tmp_path}: cannot be written: No space left on device; make room\n"
     assert {path.name for path in tmp_path.iterdir()} == {"claims.json", "runs.json", "configuration.json", "report.html"}
 
 
@@ -339,3 +341,33 @@ def test_what_would_steer_a_terminal_is_escaped(tmp_path: Path, capsys: pytest.C
         with pytest.raises(SystemExit):
             main(words)
         assert "\x1b" not in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
+def test_what_cannot_be_printed_is_named(tmp_path: Path) -> None:
+    Trace.from_steps("aba", ["travel"] * 2).save(tmp_path / "trace.jsonl")
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "ssh_abduction", "solve", str(tmp_path / "trace.jsonl")],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+    assert done.returncode == 1
+    assert done.stderr.decode().endswith("standard output: cannot be written: No space left on device; make room\n")
+
+
+@pytest.mark.parametrize("name", ["", "a\0b"])
+def test_a_name_that_is_none_stands_in_its_error(name: str) -> None:
+    with pytest.raises(TraceError, match=r"cannot write the trace: .*; name a file") as error:
+        Trace.from_steps("aba", ["travel"] * 2).save(name)
+    assert not str(error.value).startswith("output")
+
+
+@pytest.mark.parametrize("target", ["nowhere/file", "file/under", "folder"])
+def test_an_error_names_the_file_and_no_draft(target: str, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    path = tmp_path / target
+    with pytest.raises(OSError, match=re.escape(f"'{path}'") + "$"):
+        write_file(path, b"x")

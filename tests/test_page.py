@@ -291,6 +291,15 @@ def test_server_answers_only_who_knows_its_token_from_this_computer(server: Page
     assert asked(server, "POST", own + "solve", {"same": "x" * 200_000}) == (403, b"")
 
 
+@pytest.mark.parametrize("length", ["9" * 5000, "-1", "", "+2", " ", "2.0", "0x2", "²", "٢", "2\r\nContent-Length: 3"])
+def test_a_length_that_is_none_is_refused(server: PageServer, length: str) -> None:
+    own = server.url.partition(str(server.port))[2]
+    with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
+        head = f"POST {own}solve HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nContent-Type: application/json\r\nContent-Length: {length}\r\n\r\n{{}}"
+        connection.sendall(head.encode())
+        assert connection.recv(100).startswith(b"HTTP/1.0 403")
+
+
 def test_question_whose_asker_is_gone_is_given_up(server: PageServer, monkeypatch: pytest.MonkeyPatch) -> None:
     own = server.url.partition(str(server.port))[2]
     monkeypatch.setattr("ssh_abduction.rivals.page.answers.solved", sleep)

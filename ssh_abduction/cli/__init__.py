@@ -141,7 +141,7 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def unwritten(error: OSError, output: object = "output") -> str:
+def unwritten(error: OSError, output: object) -> str:
     """What is said of a file that cannot be written.
 
     Args:
@@ -200,7 +200,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        print(f"ssh-abduction: {unwritten(error)}", file=sys.stderr)
+        print(f"ssh-abduction: {unwritten(error, getattr(options, 'output', None) or 'standard output')}", file=sys.stderr)
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_ERROR

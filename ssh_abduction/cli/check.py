@@ -73,15 +73,16 @@ def run(options: argparse.Namespace) -> int:
         doubt = "the file does not say of which theory"
     elif theory.resolve(trace).replace(prefer=()) != solved.resolve(trace).replace(prefer=()):
         doubt = "the file is of another theory"
-    proven = _bound(trace, data, theory, maps, doubt, (solved or theory).resolve(trace))
+    proven = _bound(trace, data, theory, maps, doubt, (solved or theory).resolve(trace), bool(broken))
     return EXIT_VIOLATED if broken or not proven else 0
 
 
-def _bound(trace: Trace, data: Any, theory: Theory, maps: Sequence[SSHMap], doubt: str | None, solved: Theory) -> bool:
+def _bound(trace: Trace, data: Any, theory: Theory, maps: Sequence[SSHMap], doubt: str | None, solved: Theory, broken: bool) -> bool:
     """Print what the certificate of the file proves, and what the file says wrongly of itself. Says whether all of it holds.
 
     doubt   why clingo's verdict cannot be taken for one on this trace and theory, if so
     solved  the theory that the file is of
+    broken  whether some maps break axioms
     """
     fewest = min((len(m.dstates) for m in maps), default=None)
     if RESTS_ON - set(theory.axioms):
@@ -92,7 +93,8 @@ def _bound(trace: Trace, data: Any, theory: Theory, maps: Sequence[SSHMap], doub
     for fault in bound.faults:
         print(f"bound: {printable(fault)}")
     false = [*false_claims(data, maps, len(trace), solved, bound.dstates + len(bound.refuted)), *_false_of_maps(data, maps, trace)]
-    false += () if false else _false_of_all(data, trace)
+    if not false and not broken and "theory" in data:
+        false += _false_of_all(data, trace)
     for claim in false:
         print(printable(claim))
     if bound.faults:
@@ -131,7 +133,11 @@ def _false_of_maps(data: Mapping[str, Any], maps: Sequence[SSHMap], trace: Trace
 
 def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
     """What the file says wrongly of what its maps share. Its other claims hold, so that it can be read as a solution."""
-    solution = Solution.from_dict(data, "the file", trace)
+    try:
+        solution = Solution.from_dict(data, "the file", trace)
+    except MapError as error:
+        yield str(error)
+        return
     backbone = solution.backbone
     if backbone and backbone.proven and solution.minimal_listed:
         sharing = Sharing()
