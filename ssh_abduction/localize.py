@@ -394,7 +394,7 @@ class Localiser:
         if trace is not None:
             counts.update((x, step.view) for x, step in zip(self.ssh_map.labels, trace, strict=True) if step.view is not None)
         seen = {x for x, _ in counts}
-        counts.update((s.id, s.view) for s in self.ssh_map.dstates if s.id not in seen)
+        counts.update((s.id, s.view) for s in self.ssh_map.dstates if s.id not in seen and s.view is not None)
         visits = Counter[int]()
         for (x, _), n in counts.items():
             visits[x] += n

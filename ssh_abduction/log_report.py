@@ -220,7 +220,7 @@ def _visits(imported: Imported, solution: Solution) -> str:
                 t,
                 step.extra["visit"],
                 step.extra["scan"],
-                step.view,
+                "?" if step.view is None else step.view,
                 star,
                 step.action.name if step.action else "",
                 state.id if state else "–",

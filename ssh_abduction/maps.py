@@ -44,6 +44,7 @@ DRAWN = 150
 class DState:
     """A distinctive state: a position and a heading that hill-climbing brings the robot to.
 
+    view         None where the view of each step at it is unknown
     place, path  None where the theory has none, or the dstate is along no path
     direction    +1 or -1: the way that the dstate faces along its path
     heading      with star=frame the slot (0 to 3, clockwise) of the frame of its place that it faces; with star=gateways degrees (0 to 359), clockwise from the
@@ -51,11 +52,16 @@ class DState:
     """
 
     id: int
-    view: View
+    view: View | None
     place: int | None = None
     path: int | None = None
     direction: int | None = None
     heading: int | None = field(default=None, compare=False)
+
+    @property
+    def shown(self) -> View:
+        """The view as people read it: ? where it is unknown."""
+        return "?" if self.view is None else self.view
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +197,9 @@ class SSHMap:
             leads.setdefault(source, []).append(f"{action} → {target}")
         topological = bool(self.places)
         head = ("dstate", "view", *(("place", "path") if topological else ()), "links")
-        rows = [(s.id, s.view, *(_where(s) if topological else ()), ", ".join(leads.get(s.id, ()))) for s in self.dstates[: cards.ROWS + 1]]
+        rows = [
+            (s.id, s.shown, *(_where(s) if topological else ()), ", ".join(leads.get(s.id, ()))) for s in self.dstates[: cards.ROWS + 1]
+        ]
         table = cards.table(head, [*rows, *(() for _ in self.dstates[len(rows) :])], "dstates")
         return cards.card(repr(self)[1:-1], *parts, cards.folded(counted(len(self.dstates), "dstates"), table))
 
@@ -424,7 +432,7 @@ class SSHMap:
         causal = self.to_networkx()
         graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
         for s, data in causal.nodes(data=True):
-            graph.add_node(s, **{**data, "view": xml_text(str(data["view"]))})
+            graph.add_node(s, **{**data, **({"view": xml_text(str(data["view"]))} if "view" in data else {})})
         for source, target, action in causal.edges(data="action"):
             name = xml_text(action)
             key = name if not graph.has_edge(source, target, name) else f"{name} ({graph.number_of_edges(source, target)})"
@@ -440,7 +448,7 @@ class SSHMap:
 
         def node(s: DState) -> str:
             course = "" if s.path is None else f"\npath {s.path}{'+' if s.direction == 1 else '-'}"
-            return f"{s.id} [label={quoted(f'{s.id}: {s.view}{course}')}];"
+            return f"{s.id} [label={quoted(f'{s.id}: {s.shown}{course}')}];"
 
         lines = ["digraph map {", "  node [shape=box, style=rounded];"]
         lines += [f"  {node(s)}" for s in self.dstates if s.place is None]
@@ -604,8 +612,13 @@ class FieldReader:
     def dstate(self, value: Any, name: str) -> DState:
         record = self.mapping(value, name)
         view = record.get("view")
-        if isinstance(view, bool) or not isinstance(view, str | int) or (isinstance(view, str) and not is_writable(view)):
-            raise self.wrong(f"{name}.view", "a text or an integer", view)
+        if (
+            "view" not in record
+            or isinstance(view, bool)
+            or not isinstance(view, str | int | None)
+            or (isinstance(view, str) and not is_writable(view))
+        ):
+            raise self.wrong(f"{name}.view", "a text or an integer, or null where it is unknown", view)
         direction = self.optional(record.get("direction"), f"{name}.direction")
         path = self.optional(record.get("path"), f"{name}.path")
         if direction not in (None, 1, -1) or (direction is None) != (path is None):

@@ -107,7 +107,7 @@ class _Picture:
         pose, colour = self.poses[s.id], "#000" if s.id == self.map.labels[0] else _colour(s)
         (ax, ay), (bx, by) = self.along(s, BEGIN), self.along(s, END)
         u = self.unit
-        title = f"dstate {s.id}: {s.view}, at {pose.x:.1f}, {pose.y:.1f} m, heading {math.degrees(pose.heading):.0f}°"
+        title = f"dstate {s.id}: {s.shown}, at {pose.x:.1f}, {pose.y:.1f} m, heading {math.degrees(pose.heading):.0f}°"
         for share in (0.0, 0.5, 1.0):
             x, y = ax + (bx - ax) * share, ay + (by - ay) * share
             self.keep_clear(x - 4 * u, y - 4 * u, x + 4 * u, y + 4 * u)

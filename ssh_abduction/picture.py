@@ -103,7 +103,7 @@ def _dstates(ssh_map: SSHMap, place: int, at: Point, found: Layout) -> list[str]
         dx, dy = math.cos(bearing), math.sin(bearing)
         aside = (0.0, 0.0) if s.path is None else (-dy * LANE, dx * LANE)  # drawn to the right of the line of the path
         colour = "#555" if s.path is None else COLOURS[s.path % len(COLOURS)]
-        title = f"dstate {s.id}: {s.view}"
+        title = f"dstate {s.id}: {s.shown}"
         px, py = x + dx * (RADIUS + 6) + aside[0], y + dy * (RADIUS + 6) + aside[1]
         marks.append(
             f'<g><title>{escaped(title)}</title><path d="M-5,-5 L5,0 L-5,5 Z" fill="{colour}" '
@@ -144,8 +144,8 @@ def _causal(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:
         x, y = at[s.id]
         marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{RADIUS}" fill="white" stroke="{COLOURS[0]}" stroke-width="2"/>')
         marks.append(text(x, y, f"x{s.id}", "#222", weight="bold"))
-        label = str(s.view) if len(str(s.view)) <= LONGEST_LABEL else f"…{str(s.view)[1 - LONGEST_LABEL :]}"
-        marks.append(f"<g><title>{escaped(f'dstate {s.id}: {s.view}')}</title>{text(x, y + RADIUS + 12, label, '#222', halo=True)}</g>")
+        label = str(s.shown) if len(str(s.shown)) <= LONGEST_LABEL else f"…{str(s.shown)[1 - LONGEST_LABEL :]}"
+        marks.append(f"<g><title>{escaped(f'dstate {s.id}: {s.shown}')}</title>{text(x, y + RADIUS + 12, label, '#222', halo=True)}</g>")
         if s.id in faults:
             marks.append(fault_mark(x + RADIUS, y - RADIUS, faults[s.id]))
     return marks, at

@@ -88,7 +88,7 @@ class Route:
     by: str
     start: int
     goal: str
-    view: View
+    view: View | None
     place: int | None
     moves: tuple[Move, ...]
     agree: tuple[int, ...] = ()

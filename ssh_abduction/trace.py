@@ -147,7 +147,7 @@ STANDARD_ACTIONS: dict[str, Action] = {
 class Step:
     """What was seen at one moment, and the action taken next (None on the last step of a trace).
 
-    view          name or number of the view; None while only an image is there
+    view          name or number of the view; None where it is unknown, or while only an image is there
     star          the openings ahead, right, back and left as four 0/1, None where not observed; or their bearings in degrees, clockwise from ahead; or Gateways
     displacement  (dx, dy, dtheta) from the last step, in metres and radians, in the frame that the robot had there: x ahead, y left, counterclockwise;
                   that of the first step, which no step comes before, says nothing
@@ -196,16 +196,16 @@ class Step:
 
     @staticmethod
     def of(
-        view: View,
+        view: View | None,
         star: Sequence[Any] | None = None,
         where: str = "step",
         action: Action | None = None,
         displacement: Sequence[float] | None = None,
         covariance: Sequence[Sequence[float]] | None = None,
     ) -> Step:
-        """A step from a view, and perhaps a star and a displacement. Raises TraceError that says where."""
+        """A step from a view, or None where it is unknown, and perhaps a star and a displacement. Raises TraceError that says where."""
         a_text("where", where, TraceError)
-        seen, openings = _view(view, f"{where}: view"), None if star is None else parse_star(star, f"{where}: star")
+        seen, openings = _view_or_unknown(view, f"{where}: view"), None if star is None else parse_star(star, f"{where}: star")
         try:
             return Step(seen, action, openings, displacement, covariance)  # type: ignore[arg-type]
         except TraceError as error:
@@ -243,7 +243,8 @@ class Step:
             "truth": self.truth,
             "confidence": self.confidence,
         }
-        return {**{k: v for k, v in known.items() if v is not None}, **self.extra}
+        unknown = {"view": None} if self.view is None and self.image is None else {}
+        return {**unknown, **{k: v for k, v in known.items() if v is not None}, **self.extra}
 
 
 @dataclass(frozen=True)
@@ -390,7 +391,7 @@ class Trace:
     @classmethod
     def from_steps(
         cls,
-        views: Iterable[View],
+        views: Iterable[View | None],
         actions: Iterable[Action | str | Mapping[str, Any]],
         *,
         stars: Iterable[Sequence[Any] | None] | None = None,
@@ -399,7 +400,7 @@ class Trace:
         odometry: Odometry | Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> Trace:
-        """A trace from n + 1 views, the n actions between them, perhaps n + 1 stars, and perhaps n displacements. Raises TraceError.
+        """A trace from n + 1 views (None where a view is unknown), the n actions between them, perhaps n + 1 stars, and perhaps n displacements. Raises TraceError.
 
         stars          the openings seen at each step, as in Step
         displacements  [dx, dy, dtheta] of each action, in metres and radians; None where one is not known
@@ -446,15 +447,15 @@ class Trace:
             steps=tuple(replace(step, displacement=None, covariance=None) if t in unknown else step for t, step in enumerate(self.steps)),
         )
 
-    def with_views(self, views: Iterable[View], confidences: Iterable[float | None] | None = None) -> Trace:
-        """This trace with these views, and perhaps how probable it is that each is right, one for each step. Raises TraceError."""
+    def with_views(self, views: Iterable[View | None], confidences: Iterable[float | None] | None = None) -> Trace:
+        """This trace with these views, None where one is unknown, and perhaps how probable it is that each is right, one for each step. Raises TraceError."""
         seen = _listed(views, "views")
         sure = [None] * len(seen) if confidences is None else _listed(confidences, "confidences")
         for name, values in (("views", seen), ("confidences", sure)):
             if len(values) != len(self):
                 raise TraceError(f"{name}: expected {len(self)}, one a step, got {len(values)}")
         checked = [
-            (_view(view, f"views[{i}]"), None if c is None else _probability(c, f"confidences[{i}]"))
+            (_view_or_unknown(view, f"views[{i}]"), None if c is None else _probability(c, f"confidences[{i}]"))
             for i, (view, c) in enumerate(zip(seen, sure, strict=True))
         ]
         return replace(
@@ -632,8 +633,10 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
 def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> Step:
     view = _view(record["view"], f"{where}: view") if record.get("view") is not None else None
     image = _image(record["image"], f"{where}: image") if record.get("image") is not None else None
-    if view is None and image is None:
-        raise TraceError(f"{where}: view: expected a text or an integer (or an image to make one from), got none; say what the robot saw")
+    if view is None and image is None and "view" not in record:
+        raise TraceError(
+            f"{where}: view: expected a text or an integer (or an image to make one from), got none; say what the robot saw, or null where that was not logged"
+        )
     action = None
     if (raw := record.get("action")) is not None:
         action = _action(raw, f"{where}: action")
@@ -671,6 +674,10 @@ def _listed(values: Any, name: str) -> list[Any]:
     if not isinstance(values, Iterable) or isinstance(values, bytes | Mapping):
         raise TraceError(f"{name}: expected a list, got {brief(values)}; give one value a step")
     return list(values)
+
+
+def _view_or_unknown(value: Any, where: str) -> View | None:
+    return None if value is None else _view(value, where)
 
 
 def _view(value: Any, where: str) -> View:

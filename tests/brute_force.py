@@ -194,8 +194,8 @@ def _labellings(trace: Trace, on: Axioms) -> Iterator[Labels]:
     def allowed(labels: Labels) -> bool:
         last = len(labels) - 1
         for i in range(last):
-            # C1: a dstate has one view.
-            if "functional_view" in on and labels[i] == labels[last] and views[i] != views[last]:
+            # C1: a dstate has one view. A view that is unknown may be any.
+            if "functional_view" in on and labels[i] == labels[last] and len({views[i], views[last]} - {None}) > 1:
                 return False
             # C2: the same action done in the same dstate leads to the same dstate.
             same_start = i > 0 and labels[i - 1] == labels[last - 1] and actions[i - 1] == actions[last - 1]

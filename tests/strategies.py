@@ -141,6 +141,7 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "misread": st.just(0.0),  # tests/test_faults.py has tests of its own
         "slipped": st.just(0.0),
         "jumped": st.just(0.0),
+        "unknown_views": st.just(False),  # the trace says it
         "same": _seldom(_pairs(len(trace))),
         "different": _pairs(len(trace)),
         "elsewhere": _pairs(len(trace)),

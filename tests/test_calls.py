@@ -109,6 +109,7 @@ RIGHT_BY_NAME: dict[str, set[str]] = {
     "turned": {"3.5", "huge"},
 }
 RIGHT: dict[str, set[str]] = {
+    "Step.of.view": {"None", "-1", "empty text", "nonsense", "folder"},
     "Action.of.value": {"nonsense", "folder"},
     "Action.that_slipped.step": {"huge"},
     "Belief.found_again.sure": {"3.5", "huge"},

@@ -68,7 +68,7 @@ def test_maps_survive_files(tmp_path: Path) -> None:
         ({"places": []}, "places: expected every id that is used, got none for [0, 1]"),
         ({"paths": [{"id": 3, "order": []}]}, "paths: expected every id that is used, got none for [0]"),
         ({"dstates": [{"id": 1, "view": "a"}]}, "dstates: expected the ids 0, 1, 2"),
-        ({"dstates": [{"id": 0, "view": None}]}, "dstates[0].view: expected a text or an integer"),
+        ({"dstates": [{"id": 0}]}, "dstates[0].view: expected a text or an integer"),
         ({"dstates": [{"id": 0, "view": "a", "path": 0}]}, "dstates[0].direction: expected 1 or -1 where there is a path"),
     ],
 )

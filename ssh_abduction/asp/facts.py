@@ -72,8 +72,7 @@ def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
     facts = []
     for t in range(start, stop):
         step = trace.steps[t]
-        assert step.view is not None
-        facts.append(f"view({t},{_constant(step.view)}).")
+        facts.append(f"unknown({t})." if step.view is None else f"view({t},{_constant(step.view)}).")
         if theory.star in ("pattern", "frame"):
             facts += [f"open({t},{slot})." for slot, is_open in enumerate(step.openings or ()) if is_open]
     done = {t: trace.actions[t] for t in range(max(start - 1, 0), stop - 1)}
@@ -304,22 +303,22 @@ def _map(
     )
 
 
-def views_of(labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int, str]] = ()) -> dict[int, View]:
-    """The view of each dstate: that of its first step at which it is not misread.
+def views_of(labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int, str]] = ()) -> dict[int, View | None]:
+    """The view of each dstate: that of its first step at which it is known and not misread; None where there is no such step.
 
     labels  the dstate of each step
     faults  steps and kinds of faults
     """
     misread = {t for t, kind in faults if kind == "misread"}
-    views: dict[int, View] = {}
+    views: dict[int, View | None] = dict.fromkeys(labels.values())
     for t in sorted(labels):
-        if t not in misread:
-            views.setdefault(labels[t], _view(trace, t))
+        if t not in misread and views[labels[t]] is None:
+            views[labels[t]] = trace.steps[t].view
     return views
 
 
 def faults_of(
-    faults: Iterable[tuple[int, str]], labels: Mapping[int, int], views: Mapping[int, View], trace: Trace, theory: Theory
+    faults: Iterable[tuple[int, str]], labels: Mapping[int, int], views: Mapping[int, View | None], trace: Trace, theory: Theory
 ) -> tuple[Fault, ...]:
     """The faults as a map tells them."""
     found = []

@@ -66,6 +66,10 @@ def run(options: argparse.Namespace) -> int:
         raise MapError(
             "bound: expected a theory without faults (misread, slipped), as where steps may be disbelieved no clique of them proves anything"
         )
+    if resolved.unknown_views:
+        raise MapError(
+            "bound: expected a trace whose views are all known, as a step whose view is unknown may be any dstate; leave out --bound"
+        )
     doubt = None
     if broken:
         doubt = "some maps break axioms"

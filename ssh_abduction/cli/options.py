@@ -13,7 +13,7 @@ from typing import Any
 
 from ssh_abduction.errors import MapError, SSHError, named
 from ssh_abduction.maps import read_json
-from ssh_abduction.theory.theory import ASSERTIONS, CHOICES, COUNTS, EXCUSED, PRESETS, Theory
+from ssh_abduction.theory.theory import ASSERTIONS, CHOICES, COUNTS, EXCUSED, PRESETS, SETTLED, Theory
 from ssh_abduction.trace import Trace
 
 Verbs = Any  # argparse's type for what add_subparsers returns is private
@@ -27,7 +27,7 @@ def add_theory(parser: argparse.ArgumentParser, default: str = "topological, or 
         group.add_argument(f"--{name.replace('_', '-')}", choices=values)
     said = dict(re.findall(r"^ +(\w+)  +(.+)$", Theory.__doc__ or "", re.MULTILINE))
     for field in fields(Theory):
-        if isinstance(field.default, bool):
+        if isinstance(field.default, bool) and field.name not in SETTLED:
             group.add_argument(f"--{field.name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=said.get(field.name))
     group.add_argument("--reject", type=float, metavar="P", help=said.get("reject"))
     group.add_argument("--joint", type=int, metavar="N", help=said.get("joint"))
@@ -142,7 +142,7 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
             default = default.resolve(trace)
     for field in fields(Theory):
         value, flag = getattr(theory, field.name), f"--{field.name.replace('_', '-')}"
-        if value == getattr(default, field.name) or field.name in ("level", "returns"):
+        if value == getattr(default, field.name) or field.name in ("level", *SETTLED):
             continue
         if isinstance(value, bool):
             flags.append(flag if value else f"--no-{flag[2:]}")

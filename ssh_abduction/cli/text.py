@@ -102,7 +102,7 @@ def describe(ssh_map: SSHMap) -> str:
     for source, action, target in ssh_map.links:
         leads.setdefault(source, []).append(f"{action} → {target}")
     rows = [
-        [s.id, s.view, "" if s.place is None else s.place, course(s.path, s.direction), ", ".join(leads.get(s.id, []))]
+        [s.id, s.shown, "" if s.place is None else s.place, course(s.path, s.direction), ", ".join(leads.get(s.id, []))]
         for s in ssh_map.dstates
     ]
     if any(s.place is not None for s in ssh_map.dstates):
@@ -117,7 +117,7 @@ def describe_backbone(backbone: Backbone, trace: Trace) -> str:
     steps: dict[int, list[int]] = {}
     for t, number in enumerate(backbone.dstates.always):
         steps.setdefault(number, []).append(t)
-    rows = [[trace.steps[some[0]].view, stretches(some)] for some in steps.values()]
+    rows = [[next((view for t in some if (view := trace.steps[t].view) is not None), "?"), stretches(some)] for some in steps.values()]
     parts = [
         table(["view", "steps at one dstate in all minimal maps" if backbone.proven else "steps at one dstate in all maps found"], rows)
     ]

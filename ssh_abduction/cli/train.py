@@ -146,7 +146,7 @@ def run_tell_apart(options: argparse.Namespace) -> int:
     if not isinstance(features, ReciprocalTransformer):
         raise MapError(f"{options.trace}: expected a trace with ranges, as beams are told of, got panoramas; take a trace of a laser")
     images = ReciprocalTransformer().fit_transform(ranges)
-    views = {s.id: s.view for s in ssh_map.dstates}
+    views = {s.id: s.view for s in ssh_map.dstates if s.view is not None}
     alike = [(a, b) for a in views for b in views if a < b and views[a] == views[b]]
     seen = {label for label in set(labels.tolist()) if (labels == label).sum() > 1}
     pairs = [options.dstates] if options.dstates else [p for p in alike if seen.issuperset(p)]

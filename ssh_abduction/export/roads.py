@@ -82,14 +82,18 @@ class Roads:
             members = {p: [s for s in ssh_map.dstates if s.place == p] for p in ssh_map.places}
             stops = tuple(
                 Stop(
-                    p, *drawn.places[p], next((h for s in ds if (h := drawn.dstates[s.id][2]) is not None), 0.0), tuple(s.view for s in ds)
+                    p,
+                    *drawn.places[p],
+                    next((h for s in ds if (h := drawn.dstates[s.id][2]) is not None), 0.0),
+                    tuple(s.view for s in ds if s.view is not None),
                 )
                 for p, ds in members.items()
             )
             ends = _streets(ssh_map)
         else:
             stops = tuple(
-                Stop(s.id, x, y, heading or 0.0, (s.view,)) for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
+                Stop(s.id, x, y, heading or 0.0, () if s.view is None else (s.view,))
+                for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
             )
             ends = {
                 (s, x): (action, here.path if here.path == there.path else None, here.direction if here.path == there.path else None)

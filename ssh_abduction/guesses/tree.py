@@ -98,6 +98,7 @@ class Sketch:
         seen = dict(zip(reversed(ssh_map.labels), reversed(trace.steps), strict=True))
         for s in ssh_map.dstates:
             place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
+            assert s.view is not None
             sketch._states.append(_Known(s.view, observation(seen[s.id], theory), place, heading, s.path, direction))
             stars.setdefault(place, sketch._star(seen[s.id], heading))
             if s.path is not None:

@@ -278,7 +278,7 @@ class _Reading:
         doubted = {(fault.kind, fault.step) for fault in self.map.faults}  # whether the theory allows these faults is judged apart
         for i, (label, step) in enumerate(zip(labels, self.trace.steps, strict=False)):
             self.first.setdefault(label, i)
-            if ("misread", i) not in doubted:
+            if ("misread", i) not in doubted and step.view is not None:
                 self.views.setdefault((label, step.view), i)
             if with_stars and ("misseen", i) not in doubted and (openings := step.openings) is not None:
                 self.stars.setdefault((label, openings), i)
@@ -524,14 +524,14 @@ def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | N
 
 
 def _dstates_look_as_seen(m: _Reading) -> Found:
-    """A dstate has the view of the first step there at which it is not misread. The views of its other steps are judged under functional_view."""
+    """A dstate has the view of the first step there at which it is known and not misread. The views of its other steps are judged under functional_view."""
     shown: dict[int, tuple[View | None, int]] = {}
     for (label, view), i in m.views.items():
         shown.setdefault(label, (view, i))
     for first, s in m.visited:
         view, i = shown.get(s.id, (None, first))
         if s.view != view:
-            said = f"looks like {view!r} at step {i}" if s.id in shown else "is misread wherever it is visited"
+            said = f"looks like {view!r} at step {i}" if s.id in shown else "is unknown or misread wherever it is visited"
             yield [i], f"Dstate {s.id} has the view {s.view!r} in the map, but {said}."
 
 
@@ -547,6 +547,7 @@ def _faults_are_allowed(m: _Reading) -> Found:
             yield [], f"The map disbelieves step {i} ({kind}), which the theory does not allow."
         elif (
             not 0 <= i < min(len(m.trace), len(m.map.labels))
+            or (kind == "misread" and m.trace.steps[i].view is None)
             or (kind == "slipped" and m.trace.steps[i].action is None)
             or (kind == "jumped" and m.trace.steps[i].displacement is None)
         ):

@@ -15,7 +15,7 @@ from itertools import combinations
 from typing import Any
 
 from ssh_abduction.errors import MapError, brief
-from ssh_abduction.trace import Trace
+from ssh_abduction.trace import Step, Trace
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +64,16 @@ def _integers(values: Any) -> bool:
     return isinstance(values, list) and all(isinstance(value, int) and not isinstance(value, bool) for value in values)
 
 
+def _look_different(here: Step, there: Step) -> bool:
+    """Whether both views are known, and are different."""
+    return None not in (here.view, there.view) and here.view != there.view
+
+
 def _common_actions(trace: Trace, i: int, j: int) -> list[str]:
     """The actions done after both steps, until the views differ, the actions differ, or the trace ends: the word of a pair if a certificate has no words."""
     word: list[str] = []
     for here, there in zip(trace.steps[i:], trace.steps[j:], strict=False):
-        if here.view != there.view or here.action is None or there.action is None or here.action.name != there.action.name:
+        if _look_different(here, there) or here.action is None or there.action is None or here.action.name != there.action.name:
             break
         word.append(here.action.name)
     return word[: len(trace) - 1 - max(i, j)]
@@ -81,6 +86,7 @@ def _not_apart(trace: Trace, i: int, j: int, word: Sequence[str]) -> str | None:
             action = trace.steps[step].action if step < len(trace) else None
             if action is None or action.name != name:
                 return f"steps {i} and {j}: {brief(name)} is not what was done at step {step}"
-    if trace.steps[i + len(word)].view == trace.steps[j + len(word)].view:
-        return f"steps {i} and {j}: {' '.join(word) or 'nothing done'} leads to the same view from both"
+    if not _look_different(trace.steps[i + len(word)], trace.steps[j + len(word)]):
+        led = "the same view" if trace.steps[i + len(word)].view == trace.steps[j + len(word)].view else "a view that is unknown"
+        return f"steps {i} and {j}: {' '.join(word) or 'nothing done'} leads to {led} from both"
     return None

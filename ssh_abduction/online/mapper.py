@@ -118,7 +118,7 @@ class OnlineMapper:
         maps: int = 100,
         speedups: Speedups = ALL,
     ) -> None:
-        first = replace(Step.of(view, star, "step 0"), confidence=confidence)
+        first = replace(Step.of(_known(view, 0), star, "step 0"), confidence=confidence)
         theory = checked_theory(theory)
         if theory.jumped:
             raise TheoryError(
@@ -235,7 +235,7 @@ class OnlineMapper:
         """
         began = time.perf_counter()
         done = Action.of(action)
-        step = Step.of(view, star, f"step {len(self._steps)}", displacement=displacement, covariance=covariance)
+        step = Step.of(_known(view, len(self._steps)), star, f"step {len(self._steps)}", displacement=displacement, covariance=covariance)
         step = replace(step, confidence=confidence)
         self._take(done, step, began)
         self.solution = self._recovery.solution if self._recovery else self._answer(began)
@@ -438,6 +438,13 @@ class OnlineMapper:
         if not sketch.certain or not self._trusts_sketches:
             sketch.certain = not check(self.trace, sketch.map(), self._without_evidence)
         return sketch.certain
+
+
+def _known(view: View, step: int) -> View:
+    """The view of a step. Raises TraceError where it is unknown: only a whole trace may have such steps."""
+    if view is None:
+        raise TraceError(f"step {step}: view: expected one while a robot drives, got none; log the trace, and solve it as a whole")
+    return view
 
 
 @dataclass(slots=True)

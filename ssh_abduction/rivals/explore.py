@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -298,7 +298,7 @@ class _Laboratory:
         settled = theory if theory is None or trace is None else theory.resolve(trace)
         self._can, self._watch = can, watch
         self._sights = Sights(rivals, trace, theory)
-        self._links = [links_of(ssh_map, i) for i, ssh_map in enumerate(rivals)]
+        self._links = [_to_known_views(links_of(ssh_map, i), ssh_map) for i, ssh_map in enumerate(rivals)]
         self.stopped: Stop | None = None
         known = {action.name: action for action in (*actions, *(trace.actions if trace else ()))}
         names = sorted({action for ssh_map in rivals for _, action, _ in ssh_map.links} | {action.name for action in actions})
@@ -527,3 +527,8 @@ def _acts(actions: Sequence[str]) -> str:
 def told_rivals(rivals: Sequence[int]) -> str:
     """map 1, or maps 1–3 and 7."""
     return f"{'map' if len(rivals) == 1 else 'maps'} {stretches(rivals)}"
+
+
+def _to_known_views(links: Mapping[int, Mapping[str, int]], ssh_map: SSHMap) -> dict[int, dict[str, int]]:
+    """The links to dstates whose views are known. What is seen at the others cannot be promised, so that they tell no maps apart."""
+    return {s: {action: x for action, x in tried.items() if ssh_map.dstates[x].view is not None} for s, tried in links.items()}

@@ -170,7 +170,7 @@ class Listing:
     def _name(self, i: int) -> str:
         return f"maps[{i}]" if self.source == "maps" else f"{self.source}: maps[{i}]"
 
-    def _raise_other_trace(self, first: tuple[View, ...], seen: tuple[View, ...], i: int) -> None:
+    def _raise_other_trace(self, first: tuple[View | None, ...], seen: tuple[View | None, ...], i: int) -> None:
         step = next(t for t, (a, b) in enumerate(zip(first, seen, strict=True)) if a != b)
         raise MapError(
             f"{self._name(i)}: expected the view {brief(first[step])} at step {step}, as {self._name(0)} has, got {brief(seen[step])}; "
@@ -182,10 +182,10 @@ Maps: TypeAlias = Solution | Listing | SSHMap | Iterable[SSHMap]
 
 
 def _has_one_view(theory: Theory) -> bool:
-    return "functional_view" not in theory.without
+    return "functional_view" not in theory.without and not theory.unknown_views
 
 
-def _seen(ssh_map: SSHMap) -> tuple[View, ...]:
+def _seen(ssh_map: SSHMap) -> tuple[View | None, ...]:
     """What was seen at each step, as far as a map of dstates with one view each tells."""
     views = [s.view for s in ssh_map.dstates]
     seen = [views[label] for label in ssh_map.labels]

@@ -82,7 +82,7 @@ class Sights:
         stars = _first_steps(ssh_map) if trace is not None and reading is not None else {}
         return [self._number(s.view, stars.get(s.id), trace, reading) for s in ssh_map.dstates]
 
-    def _number(self, view: View, step: int | None, trace: Trace | None, reading: _Reading | None) -> int:
+    def _number(self, view: View | None, step: int | None, trace: Trace | None, reading: _Reading | None) -> int:
         if step is None or trace is None or reading is None:
             return self._add((view, None), Seen(view))
         key, star = reading(step)

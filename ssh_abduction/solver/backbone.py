@@ -218,7 +218,7 @@ class _Reasoning:
     def _may_be_one(self, i: int, j: int) -> bool:
         """Whether the views of two steps let them be one dstate."""
         steps = self._task.trace.steps
-        return steps[i].view == steps[j].view or "functional_view" not in self._task.theory.hard
+        return None in (views := {steps[i].view, steps[j].view}) or len(views) == 1 or "functional_view" not in self._task.theory.hard
 
     def _entering(self, size: int) -> Iterator[int]:
         """Steps of the prefix that are not the first of their class, and that no earlier step shows to be there, as the same action led there from the same class."""

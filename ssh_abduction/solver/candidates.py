@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 
 from ssh_abduction.asp import facts
@@ -32,7 +33,8 @@ class Candidates:
     """Makes maps of the whole trace, and keeps each that is better than the best one known, and that the checker accepts."""
 
     def __init__(self, task: Task, known: Known, judging: Judging, report: Callable[[], None]) -> None:
-        self._task, self._known, self._judging, self._report = task, known, judging, report
+        self._trace = task.trace  # whose views may be unknown
+        self._task, self._known, self._judging, self._report = _with_all_views(task), known, judging, report
         self._sketching = (
             threading.Lock()
         )  # so that who asks for a snapshot waits for a sketch that is nearly done, rather than make another one
@@ -71,7 +73,12 @@ class Candidates:
         from ssh_abduction.steps.apart import Continuations  # loads numpy
 
         trace, theory, log = self._task.trace, self._task.theory, self._task.log
-        if not self._task.speedups.greedy or not row("clique").holds_for(theory) or not self._judging.can_accept:
+        if (
+            not self._task.speedups.greedy
+            or trace is not self._trace
+            or not row("clique").holds_for(theory)
+            or not self._judging.can_accept
+        ):
             return False
         apart: int | None = None
         for sketch in Sketch.all_of(trace.steps[0], theory):
@@ -86,7 +93,8 @@ class Candidates:
 
     def _attempts(self) -> list[Callable[[], None]]:
         """The ways to make a map without a search. Those that make small maps come first."""
-        known, trace, theory = self._known.partial, self._task.trace, self._task.theory
+        trace, theory = self._task.trace, self._task.theory
+        known = self._known.partial if trace is self._trace else None
         if theory.star == "gateways":
             return [partial(self._offer_gated, homing=homing) for homing in (True, False)]
         sketches = Sketch.all_of(trace.steps[0], theory)
@@ -128,8 +136,25 @@ class Candidates:
 
     def offer(self, ssh_map: SSHMap) -> None:
         """Keep a map of the whole trace if it is better than the best one known, and satisfies all axioms."""
+        if self._task.trace is not self._trace:
+            views = facts.views_of(dict(enumerate(ssh_map.labels)), self._trace)
+            ssh_map = replace(ssh_map, dstates=tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates))
         found = Found.of(ssh_map, self._task.theory)
         if self._known.is_better(found) and self._judging.accepts(ssh_map):
             _log.info("candidate of %d dstates, %d places, %d paths", len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths))
             self._known.keep(found, ssh_map.labels)
             self._task.watch.use_reserve()
+
+
+def _with_all_views(task: Task) -> Task:
+    """The same task, where steps whose views are unknown have a view that no other step has.
+
+    Each map of that trace is one of the trace itself, too: it only has fewer steps at one dstate.
+    """
+    if not task.theory.unknown_views:
+        return task
+    known, new = set(task.trace.views), "?"
+    while new in known:
+        new += "?"
+    trace = task.trace.with_views([new if view is None else view for view in task.trace.views], [s.confidence for s in task.trace.steps])
+    return Task.of(trace, replace(task.theory, unknown_views=False), task.watch, task.speedups)

@@ -110,6 +110,11 @@ def _any_theory(theory: Theory) -> bool:
     return True
 
 
+def _knows_views(theory: Theory) -> bool:
+    """Whether the views of all steps are known, so that two of them are the same or different."""
+    return not theory.unknown_views
+
+
 def _keeps_headings(theory: Theory) -> bool:
     """Whether a dstate has one heading, if it has any."""
     return theory.star != "frame" or "one_heading" in theory.hard
@@ -256,7 +261,7 @@ TABLE = (
         "clique",
         "clique",
         "Steps, or segments of paths, no two of which can be one, are given names of their own.",
-        _any_theory,
+        _knows_views,
         CAUSAL,
         EVERY,
     ),

@@ -82,6 +82,8 @@ SPOKEN_FOR = {
     *ASSERTIONS,
 }
 FAULTS = ("misread", "misseen", "slipped", "jumped")
+# The fields that a trace settles, and nobody chooses.
+SETTLED = ("returns", "unknown_views")
 CAUSAL = "Theory.causal() (--theory causal)"  # in error messages
 
 
@@ -112,6 +114,7 @@ class Theory:
                      else dstates,paths,places
     without          names of axioms left out, to see what they do
     rules            a user's own rules: paths of files over the predicates of the encodings, or Rules
+    unknown_views    whether the view of some step is unknown; the trace says it
     same, different, elsewhere  what a person knows of pairs of steps: that they are one dstate, that they are not, or that they are not even at one place
 
     The axioms and their sources are in docs/theory.md; `ssh-abduction theory` prints them.
@@ -138,6 +141,7 @@ class Theory:
     misread: float = 0.0
     slipped: float = 0.0
     jumped: float = 0.0
+    unknown_views: bool = False
 
     def __post_init__(self) -> None:
         for name, values in CHOICES.items():
@@ -339,7 +343,9 @@ class Theory:
     def resolve(self, trace: Trace) -> Theory:
         """This theory with `star`, `displacement` and `prefer` settled for a trace, after checking that the trace has what the axioms need.
 
-        Raises TraceError where a view, the kind of an action, or a star is missing, TheoryError where stars are asked for but
+        A step whose view is unknown may be at any dstate. A trace without any view has to be clustered first.
+
+        Raises TraceError where all views, the kind of an action, or a star is missing, TheoryError where stars are asked for but
         the trace has none.
         """
         checked_trace(trace)
@@ -359,7 +365,12 @@ class Theory:
         ):  # once they are counted, this may be a part of a trace
             mend = f"add them to the steps, or take {_choice('displacement', 'none')}"
             raise TheoryError(f"displacement: expected a trace with displacements for displacement=use, got none; {mend}")
-        theory = replace(self, star=star, displacement=displacement)
+        views = set(trace.views)
+        if views == {None}:
+            raise TraceError(
+                f"{trace.at(0)}: view: expected one, got only an image; cluster the images into views first (ssh-abduction cluster)"
+            )
+        theory = replace(self, star=star, displacement=displacement, unknown_views=None in views)
         counts: list[Count] = ["dstates" if count == "tenths" else count for count in theory.priorities]
         theory = replace(theory, prefer=tuple(count for count in counts if count in self.prefer or count != "excuses"))
         for i, step in enumerate(trace.steps):
@@ -375,8 +386,7 @@ class Theory:
     def require(self, step: Step, where: str) -> None:
         """Raises TraceError, which says where, if a step lacks what the axioms need. Star has to be settled."""
         a_text("where", where, TraceError)
-        if _checked_step(step).view is None:
-            raise TraceError(f"{where}: view: expected one, got only an image; cluster the images into views first (ssh-abduction cluster)")
+        _checked_step(step)
         if self.level == "topological" and step.action is not None and step.action.kind is None and not step.action.slipped:
             raise TraceError(
                 f'{where}: action.kind: expected "travel" or "turn" in a topological theory, got none for {brief(step.action.name)}; '

@@ -78,7 +78,7 @@ def content_of(source: Maps, trace: Trace | None = None, run: Run | None = None,
     for ssh_map, name in zip(maps, found.ids, strict=True):
         one: dict[str, Any] = {
             "id": name,
-            "labeling": labelings.number((ssh_map.labels, tuple(str(s.view) for s in ssh_map.dstates))),
+            "labeling": labelings.number((ssh_map.labels, tuple(str(s.shown) for s in ssh_map.dstates))),
             "places": places.number(tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)),
             "orders": orders.number(tuple((path.id, path.order) for path in ssh_map.paths)),
         }
@@ -170,7 +170,7 @@ def _replays(maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], trace: Trac
     if trace is None:
         mapped = {"name": "the trace that was mapped", "steps": _steps_of_map(first)}
     else:
-        mapped = _replay(trace, "the trace that was mapped", [str(first.dstates[label].view) for label in first.labels])
+        mapped = _replay(trace, "the trace that was mapped", [str(first.dstates[label].shown) for label in first.labels])
     if run is None:
         return [mapped]
     beliefs = _beliefs(maps, told, run)
@@ -209,7 +209,7 @@ def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
         actions.setdefault((s, x), []).append(action)
     done = [actions.get(pair, []) for pair in pairwise(first.labels)]
     names = [some[0] if len(some) == 1 else None for some in done]
-    views: list[Any] = [first.dstates[label].view for label in first.labels]
+    views: list[Any] = [first.dstates[label].shown for label in first.labels]
     for fault in first.faults:
         if fault.kind == "misread" and fault.seen is not None:
             views[fault.step] = fault.seen

@@ -28,7 +28,7 @@ class Alike:
 
     @classmethod
     def of(cls, theory: Theory) -> Alike:
-        return cls("functional_view" in theory.hard)
+        return cls("functional_view" in theory.hard and not theory.unknown_views)
 
     def pairs(self, trace: Trace) -> Pairs:
         return _pairs(tuple((step.view if self.has_one_view else None, step.gateways or Star(())) for step in trace.steps))

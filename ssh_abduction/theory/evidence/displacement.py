@@ -66,7 +66,9 @@ class Displacement:
         topological, hard = theory.level == "topological", theory.hard
         # Where displacements may be wrong, each pair of steps is excused by what lies between its own steps: so it does not stand for others of its visits.
         turns_stay = "turn_stays" in hard and not theory.jumped
-        return cls(theory.reject, theory.joint, theory.returns, topological, turns_stay, "functional_view" in hard)
+        return cls(
+            theory.reject, theory.joint, theory.returns, topological, turns_stay, "functional_view" in hard and not theory.unknown_views
+        )
 
     def pairs(self, trace: Trace) -> Pairs:
         return self.returns_of(trace).pairs

@@ -1,0 +1,143 @@
+"""Steps whose views are unknown: they may be at any dstate, and each dstate still has one view."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import theories, traces
+from test_property import LIMIT, agree
+from worlds import TOURS, drive
+
+from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
+from ssh_abduction.cli import main
+from ssh_abduction.errors import TraceError
+from ssh_abduction.judge.checker import check
+from ssh_abduction.judge.proof import check_bound
+from ssh_abduction.rivals.compare import compare
+from ssh_abduction.rivals.explore import next_experiment
+from ssh_abduction.theory.speedups import TABLE
+
+CORRIDOR = ["end", "hall", "end", "end", "hall", "end", "end"]
+HEAD = '{"format": "ssh-trace", "version": 1}\n'
+DRIVEN = ["travel", "travel", "around", "travel", "travel", "around"]
+
+
+def hidden(trace: Trace, steps: set[int]) -> Trace:
+    """The trace without the views of these steps. One view at least is kept."""
+    kept = {t for t in steps if t} if len(steps) == len(trace) else steps
+    return trace.with_views([None if t in kept else view for t, view in enumerate(trace.views)])
+
+
+@settings(max_examples=60)
+@given(st.data())
+def test_solver_and_checker_agree_with_the_brute_force(data: st.DataObject) -> None:
+    trace = data.draw(traces(max_steps=6), label="trace")
+    steps = data.draw(st.sets(st.integers(0, len(trace) - 1), min_size=1, max_size=3), label="hidden")
+    agree(hidden(trace, steps), data.draw(theories(trace), label="theory"))
+
+
+@settings(max_examples=25)
+@given(st.data())
+def test_to_hide_a_view_never_costs_anything(data: st.DataObject) -> None:
+    trace = data.draw(traces(), label="trace")
+    choices = data.draw(st.sampled_from([{}, {"misread": 1.5}, {"slipped": 1.0}, {"misread": 0.5, "slipped": 2.0}]), label="faults")
+    theory = data.draw(st.sampled_from([Theory.causal(), Theory.topological()]), label="theory").replace(**choices)
+    steps = data.draw(st.sets(st.integers(0, len(trace) - 1), min_size=1), label="hidden")
+    before, unknown = solve(trace, theory, limit=LIMIT), hidden(trace, steps)
+    after = solve(unknown, theory, limit=LIMIT)
+    for ssh_map in after.maps:
+        assert check(unknown, ssh_map, theory) == ()
+        assert not any(fault.kind == "misread" and unknown.views[fault.step] is None for fault in ssh_map.faults)
+    if before.cost:
+        assert after.cost
+        costs = [solution.cost.faults + solution.cost.dstates for solution in (before, after) if solution.cost]
+        assert costs[1] <= costs[0]
+
+
+def test_an_unknown_step_does_not_make_two_views_one() -> None:
+    """The step between could be at either dstate, but not at both."""
+    trace = Trace.from_steps(["a", None, "b"], ["stay", "stay"])
+    found = solve(trace, Theory.causal(), maps=0)
+    assert {m.labels for m in found.maps} == {(0, 0, 1), (0, 1, 1)} - {(0, 0, 1)}  # after the first, the same action would lead to b
+    assert [s.view for s in found.maps[0].dstates] == ["a", "b"]
+
+
+def test_a_dstate_that_was_never_seen_has_no_view(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trace = Trace.from_steps([None if t == 2 else view for t, view in enumerate(CORRIDOR)], DRIVEN)
+    (ssh_map,) = solve(trace, Theory.topological(), maps=0).maps
+    assert [s.view for s in ssh_map.dstates] == ["end", "hall", None, "end", "hall", "end"]
+    ssh_map.save(tmp_path / "map.json")
+    assert SSHMap.load(tmp_path / "map.json") == ssh_map
+    for text in (ssh_map.to_svg(), ssh_map.to_dot(), ssh_map._repr_html_()):
+        assert "None" not in text
+    assert "None" not in ssh_map.to_graphml()
+    trace.save(tmp_path / "trace.jsonl")
+    assert main(["solve", str(tmp_path / "trace.jsonl"), "--json"]) == 0
+    (tmp_path / "maps.json").write_text(capsys.readouterr().out)
+    for words in (
+        ["show"],
+        ["view", "-o", str(tmp_path / "page.html")],
+        *(["export", "--to", to] for to in ("nav2", "tmap2", "graphml", "dot", "networkx-json")),
+    ):
+        assert main([words[0], str(tmp_path / "maps.json"), *words[1:]]) == 0
+        assert "None" not in capsys.readouterr().out
+    assert main(["check", str(tmp_path / "trace.jsonl"), str(tmp_path / "maps.json")]) == 0
+    assert main(["check", "--bound", str(tmp_path / "trace.jsonl"), str(tmp_path / "maps.json")]) == 1
+    assert "expected a trace whose views are all known" in capsys.readouterr().err
+
+
+def test_a_null_is_unknown_and_a_missing_field_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "trace.jsonl"
+    path.write_text(HEAD + '{"view": "a", "action": "go"}\n{"view": null, "action": "go"}\n{"view": "null"}\n')
+    trace = Trace.load(path)
+    assert trace.views == ("a", None, "null")
+    trace.save(path)
+    assert Trace.load(path).steps == trace.steps
+    path.write_text(HEAD + '{"view": "a", "action": "go"}\n{"vew": "b"}\n')
+    with pytest.raises(TraceError, match=r"3: view: expected a text .* or null where that was not logged"):
+        Trace.load(path)
+    with pytest.raises(TraceError, match="view: expected one, got only an image; cluster"):
+        solve(Trace.from_steps([None, None], ["go"]))
+
+
+@pytest.mark.parametrize("theory", [Theory.causal(), Theory.topological(), Theory.circumscriptive()])
+def test_there_is_a_map_when_the_time_is_over(theory: Theory) -> None:
+    trace = drive(*TOURS["comb"])
+    trace = hidden(trace, set(range(1, len(trace), 3)))
+    found = solve(trace, theory, limit=1e-9)
+    assert found.maps
+    assert check(trace, found.maps[0], theory) == ()
+
+
+def test_no_speedup_that_reads_views_is_on() -> None:
+    theory = Theory.topological().resolve(Trace.from_steps(["a", None], ["travel"]))
+    kept = {"path_names", "sides", "lazy", "core_guided", "threads", "processes", "annealed", "greedy"}
+    assert {row.name for row in TABLE if row.holds_for(theory)} <= kept
+
+
+def test_while_a_robot_drives_each_view_is_known() -> None:
+    with pytest.raises(TraceError, match="view: expected one while a robot drives, got none"):
+        OnlineMapper("a", Theory.causal()).observe("go", None)  # type: ignore[arg-type]
+    with pytest.raises(TraceError, match="view: expected one while a robot drives, got none"):
+        OnlineMapper(None, Theory.causal())  # type: ignore[arg-type]
+
+
+def test_rivals_are_not_told_apart_by_what_was_never_seen() -> None:
+    trace = Trace.from_steps(["a", None, "a", "b", "a"], ["x", "y", "x", "y"])
+    solution = solve(trace, Theory.causal().replace(prefer=()), maps=0)
+    assert solution.count > 1
+    assert json.loads(json.dumps(compare(solution).to_dict()))
+    plan = next_experiment(solution, trace).to_dict()["plan"]
+    assert {expected["how"] for expected in plan["untried"]["expects"]} == {"link", "open"}
+    assert all((expected["view"] is None) == (expected["how"] == "open") for expected in plan["untried"]["expects"])
+
+
+def test_no_proof_rests_on_what_was_never_seen() -> None:
+    trace = Trace.from_steps(["a", None, "b"], ["go", "go"])
+    assert solve(trace, Theory.causal()).certificate is None
+    assert check_bound(trace, {"clique": [0, 1], "words": [], "refuted": []}).faults
+    assert not check_bound(trace, {"clique": [0, 2], "words": [], "refuted": []}).faults
