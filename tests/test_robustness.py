@@ -1,0 +1,35 @@
+"""The table of hostile and contradictory inputs: each row names tests that exist."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+TABLE = re.compile(r"^\| (?!kind of input|-)(.+) \|$", re.MULTILINE)
+ROWS = [row.split(" | ") for row in TABLE.findall((ROOT / "docs/robustness.md").read_text())]
+
+
+@cache
+def names_in(file: str) -> set[str]:
+    """The tests that a file defines."""
+    return set(re.findall(r"^def (test_\w+)", (ROOT / file).read_text(), re.MULTILINE))
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0][:60])
+def test_each_row_names_its_tests(row: list[str]) -> None:
+    assert len(row) == 4
+    assert all(cell.strip() for cell in row)
+    file, _, names = row[3].strip("`").partition("::")
+    tests = re.findall(r"test_\w+", names)
+    assert tests
+    assert set(tests) <= names_in(file)
+
+
+def test_no_kind_of_input_stands_twice() -> None:
+    kinds = [row[0] for row in ROWS]
+    assert len(kinds) > 40
+    assert sorted(set(kinds)) == sorted(kinds)
