@@ -16,7 +16,7 @@ demo: .venv/base
 	$(BIN)/python examples/demo.py out
 
 test: lint
-	$(BIN)/pytest -n auto --dist worksteal
+	$(BIN)/pytest -n auto --dist loadfile
 
 lint: .venv/dev
 	$(BIN)/ruff check .

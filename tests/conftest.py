@@ -6,7 +6,7 @@ import signal
 
 from hypothesis import HealthCheck, settings
 
-from ssh_abduction.cli import verbosity
+from ssh_abduction.cli import verbosity, view
 
 # No example takes too long, nor does it take too long to draw one. And the examples are the same in each run: of traces at random, some take clingo a hundred
 # times as long as others.
@@ -15,6 +15,9 @@ settings.load_profile("the same everywhere")
 
 # No line of progress comes where a command takes long; tests of these lines say when they come.
 verbosity.EVERY = math.inf
+
+# A page may spend three seconds on what assumptions cost. Tests of these costs ask for them.
+view.ASSUMING = 0.1
 
 # Programs that are begun in the background do not hear Ctrl-C, nor do those that they begin. Tests do, from any thread that is the main one.
 with contextlib.suppress(ValueError):

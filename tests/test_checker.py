@@ -400,7 +400,7 @@ def mutants(draw: st.DrawFn) -> tuple[Case, SSHMap]:
     return original, m
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(mutants(), THEORIES | st.none())
 def test_a_mutated_map_never_raises(mutant: tuple[Case, SSHMap], theory: Theory | None) -> None:
     original, m = mutant

@@ -67,7 +67,7 @@ def test_json_is_the_contract(solved: Path) -> None:
 def test_all_maps_and_a_few(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     route = saved(drive(*TOURS["comb"]), tmp_path)
     flags = ["--boundary", "none", "--path-order", "partial", "--prefer", "paths,places,dstates", "--json"]
-    for n, count, complete in (("0", 308, True), ("5", 5, False), ("308", 308, True)):
+    for n, count, complete in (("5", 5, False), ("308", 308, True)):
         assert main(["solve", route, "-n", n, *flags]) == 0
         data = json.loads(capsys.readouterr().out)
         assert (data["count"], len(data["maps"]), data["complete"]) == (count, count, complete)

@@ -68,7 +68,7 @@ products = st.lists(
 ).flatmap(lambda blocks: st.permutations(range(sum(len(block[0]) for block in blocks))).map(lambda order: _product(blocks, order)))
 
 
-@settings(max_examples=150)
+@settings(max_examples=75)
 @given(relations | products)
 def test_choices_are_the_finest_division_that_brute_force_finds(rows: list[list[bool]]) -> None:
     table = np.array(rows, dtype=bool)
@@ -80,7 +80,7 @@ def test_choices_are_the_finest_division_that_brute_force_finds(rows: list[list[
     assert {frozenset(part) for part in independent(table.T)} == {frozenset(part) for part in finest}
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(relations)
 def test_deciding_questions_tell_all_apart_and_none_is_superfluous(rows: list[list[bool]]) -> None:
     table = np.array(rows, dtype=bool)
@@ -158,7 +158,7 @@ def naive_differing(maps: Sequence[SSHMap]) -> dict[str, set[int]]:
     return {sort: differing for sort, differing in found.items() if differing}
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.data())
 def test_what_is_said_of_maps_is_so_in_the_explicit_list(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")

@@ -39,7 +39,7 @@ def maps_of(trace: Trace, theory: Theory, speedups: Speedups) -> set[object]:
     return {key(ssh_map) for ssh_map in maps}
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(broken_traces(), st.sampled_from(["none", "strict"]), st.booleans())
 def test_nothing_is_known_of_where_an_action_led_that_slipped(trace: Trace, boundary: str, framed: bool) -> None:
     theory = Theory(boundary=boundary, star="frame" if framed and trace.has_stars else "none")  # type: ignore[arg-type]
@@ -48,7 +48,7 @@ def test_nothing_is_known_of_where_an_action_led_that_slipped(trace: Trace, boun
     assert maps_of(trace, theory, Speedups()) == set(expected)
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(st.data())
 def test_maps_of_mended_traces_are_those_of_the_plain_encodings(data: st.DataObject) -> None:
     """Where all is proven: the same maps. With a star that may be misread, and actions that may slip."""

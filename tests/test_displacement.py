@@ -50,7 +50,7 @@ def circuit(
     return Trace.from_steps(views, ["travel", "right"] * sides, displacements=moved, odometry=odometry)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data())
 def test_solver_and_checker_agree_with_matrices_written_out(data: st.DataObject) -> None:
     trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")
@@ -139,7 +139,7 @@ def test_errors_that_repeat_are_estimated_along(scale: float, bend: float) -> No
         assert stiff.maps[0].labels != found.labels or stiff.odometry_warning
 
 
-@settings(max_examples=6)
+@settings(max_examples=5)
 @given(st.data())
 def test_the_jacobian_of_a_fit_is_right(data: st.DataObject) -> None:
     trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")

@@ -187,7 +187,7 @@ def test_a_laser_that_hangs_upside_down_is_said(drive: tuple[Scan, ...]) -> None
     assert "--fov 180" in doubt(tuple(Told(fov=-180).placed(scan) for scan in drive))
 
 
-@pytest.mark.parametrize("angle", [-150.0, -90.0, -30.0, 15.0, 60.0, 180.0])
+@pytest.mark.parametrize("angle", [-90.0, 15.0, 60.0, 180.0])
 def test_a_wrong_mount_is_said_with_the_likely_one(drive: tuple[Scan, ...], angle: float) -> None:
     """The laser truly looks ahead."""
     said = doubt(tuple(Told(mount=(0, 0, angle)).placed(scan) for scan in drive))

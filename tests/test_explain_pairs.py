@@ -89,7 +89,7 @@ def test_without_any_one_axiom_the_rectangles_steps_may_be_one() -> None:
         assert solution.status is (Status.UNSATISFIABLE if dropped is None else Status.OPTIMAL)
 
 
-@settings(max_examples=16)
+@settings(max_examples=8)
 @given(st.data())
 def test_verdicts_are_those_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=5), label="trace")

@@ -92,7 +92,7 @@ def told(ssh_map: SSHMap) -> Told:
     return ssh_map.labels, frozenset((fault.step, fault.kind, fault.expected) for fault in ssh_map.faults)
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(small_traces(), st.sampled_from([0.0, 0.4, 1.0]), st.sampled_from([0.0, 0.3, 1.0]), st.booleans())
 def test_causal_maps_with_faults_are_those_of_brute_force(trace: Trace, misread: float, slipped: float, names: bool) -> None:
     """By names and by the readable encoding. A cost of whole dstates makes ties."""
@@ -107,7 +107,7 @@ def test_causal_maps_with_faults_are_those_of_brute_force(trace: Trace, misread:
     assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(st.data())
 def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) -> None:
     trace = data.draw(small_traces(max_steps=7))
@@ -123,7 +123,7 @@ def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) 
     assert {told(ssh_map) for ssh_map in solution.maps} == expected
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(small_traces(max_steps=4), st.sampled_from([0.4, 1.0]))
 def test_topological_maps_are_those_of_corrected_traces(trace: Trace, misread: float) -> None:
     """Every way to correct views is tried, and the corrected trace is mapped by the brute force, which knows nothing of faults."""
@@ -162,7 +162,7 @@ def test_the_faults_of_machines_are_found(seed: int) -> None:
     assert any([fault.step for fault in ssh_map.faults] == [*wrong, *jumps] for ssh_map in solution.maps)
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(st.data())
 def test_bounds_by_blocks_are_no_more_than_the_minimum(data: st.DataObject) -> None:
     """Whatever map is known: here one dstate for each view, or one for each step, and all that disagrees is a fault."""

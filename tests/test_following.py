@@ -23,7 +23,7 @@ from tests.strategies import traces
 CAUSAL = Theory.causal()
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(traces(max_steps=30), st.data())
 def test_what_a_map_is_followed_to_is_a_map(trace: Trace, data: st.DataObject) -> None:
     """Also where the map of the beginning is wrong, or robots are told to be where few steps say so. What evidence says of steps is not known there."""

@@ -97,7 +97,7 @@ def plainly_charted(engine: FramedEngine, size: int, before: FramedChart | None 
     return Chart.framed(engine._task.trace, engine._task.log, size)
 
 
-@settings(max_examples=24)
+@settings(max_examples=12)
 @given(framed_traces(), framed_theories(), st.sets(st.sampled_from(SPEEDUPS)), st.data())
 def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off: set[str], data: st.DataObject) -> None:
     """With prefixes, cores and what is told in one go so small that all of it happens on short traces; and with any speed-ups off."""
@@ -149,7 +149,7 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         assert check(trace, ssh_map, theory) == ()
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(framed_traces(), framed_theories(), st.integers(0, 20))
 def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: Theory, sweeps: int) -> None:
     """From a guess of any quality. Names that do not fit a frame, or have no paths, are no maps; and clingo may need more names than it had."""
@@ -211,7 +211,7 @@ def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, 
     assert found.count == len(set(found.maps))
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(framed_traces(), framed_theories(), st.data())
 def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, data: st.DataObject) -> None:
     """Whether clingo is told what is new, or all of it anew."""
@@ -237,7 +237,7 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(trace: Trace, the
             assert answer.count == expected.count
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0])
 def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
     """Long enough for cores, for visits told to be transitive, and for paths, all of which the longer trace keeps."""
     trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
@@ -359,14 +359,14 @@ def test_pinned_stretches_leave_all_maps(seed: int, pinned: int, stretches: int)
     given: list[tuple[list[int], Sequence[int]]] = []
 
     def rivals(
-        among: Sequence[int], pairs: Sequence[tuple[int, int]], sought: Callable[..., list[int]] = paths_module._pairwise_distinct
+        among: Sequence[int], pairs: Sequence[tuple[int, int]], sought: Callable[..., list[int]] = paths_module.pairwise_distinct
     ) -> list[int]:
         found = sought(among, pairs)
         assert set(combinations(found, 2)) <= set(pairs)
         given.append((found, among))
         return found
 
-    with patch.object(paths_module, "_pairwise_distinct", rivals):
+    with patch.object(paths_module, "pairwise_distinct", rivals):
         maps = solve(trace, maps=0).maps
     assert any((len(found), len(among)) == (pinned, stretches) for found, among in given)
     assert len(maps) > 1
@@ -543,7 +543,7 @@ def places(walk: Walk, chart: FramedChart) -> list[object]:
     return list(place.values())
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3)), min_size=2, max_size=7), st.data())
 def test_what_fails_to_be_transitive_is_among_the_scattered(states: list[tuple[int, int]], data: st.DataObject) -> None:
     """Visits at places, but for some pairs that are left out, turned otherwise, or added."""
@@ -571,7 +571,7 @@ def test_annealing_finds_the_places_of_a_maze(seed: int) -> None:
     assert len(set(zip(guessed, places(walk, chart), strict=True))) == len(set(guessed)) == len(set(places(walk, chart)))
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(framed_traces(), st.integers(1, 20))
 def test_a_guess_holds_the_stars(trace: Trace, sweeps: int) -> None:
     """Also one that is not sure: visits of a place have the same star in its frame."""
@@ -608,7 +608,7 @@ def node_labels(ssh_map: SSHMap, chart: FramedChart) -> list[int]:
     return [ssh_map.labels[chart.node_of.index(node)] for node in range(len(chart.seen))]
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(framed_traces(), framed_theories(), st.data())
 def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: Theory, data: st.DataObject) -> None:
     """So merging by evidence may keep to it."""
@@ -626,7 +626,7 @@ def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: T
         assert all(labels[a] == labels[b] for a, b in one)
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(framed_traces(), framed_theories(), st.lists(st.integers(-1, 4), min_size=9, max_size=9), st.booleans())
 def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[int], told: bool) -> None:
     """Of the causal axioms; and where separate paths fit it, others do."""

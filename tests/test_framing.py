@@ -38,7 +38,7 @@ def started(limit: float | None = None) -> Watch:
     return watch
 
 
-@settings(max_examples=24)
+@settings(max_examples=12)
 @given(st.data())
 def test_maps_with_frames_are_maps_of_the_theory(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=10), label="trace")
@@ -55,7 +55,7 @@ def test_maps_with_frames_are_maps_of_the_theory(data: st.DataObject) -> None:
     assert costs[-1] >= len(solve(trace, theory, maps=1).maps[0].dstates)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(st.data())
 def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
     """Sought before anything else, so that it is known whenever a prefix has as cheap a map."""

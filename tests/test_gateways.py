@@ -141,7 +141,7 @@ gateways = st.builds(
 )
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(gateways, gateways, st.integers(0, 3))
 def test_rotations_are_those_of_a_plain_search(first: Frame, then: Frame, shift: int) -> None:
     if first.slots != then.slots:
@@ -203,7 +203,7 @@ def traces(draw: st.DrawFn) -> Trace:
     return Trace.from_steps(views, actions, stars=stars)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(traces(), st.data())
 def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.DataObject) -> None:
     theory = GATEWAYS.replace(
@@ -223,7 +223,7 @@ def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.Da
     assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(traces(), st.data())
 def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
     """star=alike: solver and checker against the brute force, which tries all ways to pair gateways; the maps of the bare causal theory are judged by it, too."""
@@ -238,7 +238,7 @@ def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
         assert (check(trace, ssh_map, theory) == ()) == (key(ssh_map) in allowed)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(traces(), st.sampled_from(LEFT_OUT[:5]))
 def test_checker_rejects_what_the_brute_force_does_not_find(trace: Trace, left_out: str) -> None:
     """The maps of a theory that lacks an axiom, under the axioms that have it."""

@@ -41,7 +41,7 @@ def small_traces(draw: st.DrawFn) -> Trace:
     return Trace.from_steps(draw(st.lists(st.sampled_from("aab"), min_size=steps, max_size=steps)), done, displacements=moves)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(small_traces(), st.booleans(), st.sampled_from([0.4, 1.0, 1.7]))
 def test_minimal_maps_are_the_best_of_all_ways_to_leave_displacements_out(trace: Trace, causal: bool, price: float) -> None:
     if not trace.has_displacements:

@@ -62,7 +62,7 @@ def exact_panorama(world: World, pose: tuple[float, float, float]) -> np.ndarray
 # --- what a panorama shows
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(st.integers(0, 8), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-3, 3))
 def test_a_panorama_shows_the_streets_and_where_they_meet(shape: int, dx: float, dy: float, heading: float) -> None:
     """From anywhere near the fixed point: streets to a degree, the fixed point to two centimetres."""
@@ -93,7 +93,7 @@ def test_a_street_that_goes_straight_on_is_no_place() -> None:
     assert (nothing.streets, nothing.fixed) == ((), None)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.floats(-3, 3), st.floats(-3, 3), st.floats(-0.03, 0.03), st.integers(0, 10**6))
 def test_the_compass_tells_how_the_robot_is_turned(heading: float, turn: float, error: float, seed: int) -> None:
     """Odometry is off by up to 3 % of the turn; the images know better than to half a degree."""

@@ -394,7 +394,7 @@ def test_recognition_by_poor_labels_is_poor(run: Trace) -> None:
 
 
 def test_outcomes_differ_over_notch_and_spread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", replace(EXPERIMENTS["notched-rectangle"], tours=16))
+    monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", replace(EXPERIMENTS["notched-rectangle"], tours=10))
     good, blurred, bare = outcome(0.03, 0.5), outcome(0.03, 8), outcome(0.0, 0.5)
     assert (good.k, good.right) == (4, True)
     assert good.rate > 0.99

@@ -99,7 +99,7 @@ def test_the_map_of_a_drive_joins_what_is_one_place(runs: Path) -> None:
 
 
 def test_corrected_poses_are_not_read(hall: Path) -> None:
-    log = RobotLog(read_log(hall).scans[:90], source="x")
+    log = RobotLog(read_log(hall).scans[:60], source="x")
     blind = tuple(Scan(scan.ranges, scan.laser, scan.odometry, None, scan.time, scan.line) for scan in log.scans)
     seen, unseen = (import_log(RobotLog(scans, source="x")).trace for scans in (log.scans, blind))
     assert [(s.view, s.star, s.displacement, s.action) for s in seen] == [(s.view, s.star, s.displacement, s.action) for s in unseen]
@@ -234,7 +234,7 @@ def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.Captur
 def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_alone(hall: Path, tmp_path: Path) -> None:
     question = MapQuestion(None, {}, {}, None, None, None, 1000.0, 1, False)
     small = tmp_path / "small.log"
-    small.write_text("\n".join(hall.read_text().splitlines()[:160]) + "\n")
+    small.write_text("\n".join(hall.read_text().splitlines()[:100]) + "\n")
     (answer,) = batch.here(question, [str(small)], 2, batch.Stop())
     assert answer.code in (0, 10)
     assert dict(answer.files)["run.json"]

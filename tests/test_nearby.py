@@ -54,7 +54,7 @@ def nearby_search(trace: Trace) -> NearbySearch:
     )
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(machines(most_steps=20), st.data())
 def test_from_any_guess_to_a_minimal_map(trace: Trace, data: st.DataObject) -> None:
     """Guesses that are no maps, that merge what is apart, or say nothing; with as few conflicts as make most questions be asked again."""
@@ -75,7 +75,7 @@ def test_from_any_guess_to_a_minimal_map(trace: Trace, data: st.DataObject) -> N
     assert counts[-1] == searched.bound == fewest.dstates
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(machines(), st.booleans(), st.integers(0, 10_000), st.data())
 def test_a_search_beside_another_changes_no_answer(trace: Trace, beside: bool, cores: int, data: st.DataObject) -> None:
     """In a thread or before; from any guess, right or wrong."""

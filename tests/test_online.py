@@ -66,7 +66,7 @@ def agree(trace: Trace, theory: Theory) -> None:
             assert getattr(answer.cost, name) == getattr(anew.cost, name)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data())
 def test_after_every_step_the_answer_is_that_of_solving_anew(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=9), label="trace")
@@ -78,7 +78,7 @@ def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
     agree(Trace.from_steps("abaabb", ["travel", "around", "travel", "right", "travel"]), Theory(without=(name,)))
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data())
 def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
@@ -127,7 +127,7 @@ def test_a_mapper_says_how_far_it_is() -> None:
     assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(st.data())
 def test_sketches_are_consistent(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=14), label="trace").without_displacements()  # what evidence says, a sketch does not know
@@ -161,7 +161,7 @@ def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
     return doubts
 
 
-@settings(max_examples=25)
+@settings(max_examples=13)
 @given(st.data())
 def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=10), label="trace").without_displacements()  # what evidence says, a sketch does not know
@@ -179,7 +179,7 @@ def test_a_map_goes_on_through_a_maze(stars: bool) -> None:
     assert {*doubts} == {True, False}
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data())
 def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=9), label="trace")
@@ -227,15 +227,15 @@ def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
 
 def test_maps_are_guessed_while_the_robot_drives() -> None:
     """Without time for clingo. The guess is made for some of the steps; its map goes on."""
-    walk = maze(4, 4, steps=220, seed=1, stars=True)
+    walk = maze(4, 4, steps=140, seed=1, stars=True)
     trace = walk.trace
-    with patch.object(guessing, "has_processors", lambda _: True), patch.object(online, "GUESSED", 200):
+    with patch.object(guessing, "has_processors", lambda _: True), patch.object(online, "GUESSED", 120):
         mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, limit=NO_TIME)
-        explore(trace.prefix(205), mapper)
+        explore(trace.prefix(125), mapper)
         assert mapper._guess is not None
         assert mapper._guess.map() is not None  # waits for it
         answers = explore(trace, mapper)
-    for i, answer in enumerate(answers, 206):
+    for i, answer in enumerate(answers, 126):
         assert answer.status is Status.FEASIBLE
         assert check(trace.prefix(i), answer.maps[0], mapper.theory) == ()
     assert len(answers[0].maps[0].dstates) <= 1.2 * len(set(walk.truth)) < len(mapper._sketches[0].sketch.map().dstates)
@@ -392,7 +392,7 @@ def test_displacements_may_be_asked_for_before_the_first_one_comes() -> None:
 
 def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
     """Without time for clingo, all maps are guessed or sketched, and displacements refuse none of them: not even those of steps before the threshold changed."""
-    trace = maze(4, 4, steps=60, seed=1, stars=True, odometry=Odometry(along=0.02)).trace
+    trace = maze(4, 4, steps=40, seed=1, stars=True, odometry=Odometry(along=0.02)).trace
     given: list[Trace] = []
 
     def guessed_map(trace: Trace, *others: Any) -> SSHMap | None:
@@ -405,7 +405,7 @@ def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
     with (
         patch.object(guessing, "has_processors", lambda _: True),
         patch.object(guessing, "in_process", at_once),
-        patch.object(online, "GUESSED", 40),
+        patch.object(online, "GUESSED", 25),
         patch.object(annealing, "ANNEALED", ((0.5, 50),)),
     ):
         mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, odometry=trace.odometry, limit=NO_TIME)

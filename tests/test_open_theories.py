@@ -49,7 +49,7 @@ def with_toy(toy: Toy, theory: Theory) -> Theory:
 
 @pytest.mark.parametrize("name", THEORIES)
 @pytest.mark.parametrize("toy", TOYS, ids=lambda toy: toy.rules.name)
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(data=st.data())
 def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.DataObject) -> None:
     """In one go and step by step, against the brute force; with first prefixes so short that replay would overlook it."""
@@ -200,7 +200,7 @@ class NoLongReturns:
 
 
 @pytest.mark.parametrize("name", THEORIES)
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(data=st.data())
 def test_what_evidence_refuses_of_a_map_is_forbidden(name: str, data: st.DataObject) -> None:
     """The answer is that of the brute force, whichever maps clingo finds first."""
@@ -230,7 +230,7 @@ FAST = {
 
 
 @pytest.mark.parametrize("name", FAST)
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.DataObject) -> None:
     """An engine that settles dstates first is told of it, too, and its maps are those of the brute force."""

@@ -105,7 +105,7 @@ def test_errors_of_perception_are_the_packages() -> None:
 # M
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 60), st.integers(1, 6), st.integers(2, 5), st.sampled_from(["normal", "grid", "offset"]))
 def test_quality_is_the_ratio_over_all_pairs(seed: int, count: int, beams: int, clusters: int, kind: str) -> None:
     rng = np.random.default_rng(seed)

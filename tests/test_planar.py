@@ -216,7 +216,7 @@ def loose(data: st.DataObject, trace: Trace) -> Theory:
     )
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(data=st.data())
 def test_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(winding(), label="trace")

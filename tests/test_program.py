@@ -67,9 +67,8 @@ def test_a_file_of_the_current_folder_is_run_if_nothing_is_done_about_it(hostile
     assert "csv" in (hostile / "mark").read_text()
 
 
-@pytest.mark.parametrize("first", ["", "{hostile}"], ids=["empty", "named"])
-def test_no_process_that_is_begun_runs_a_file_of_the_current_folder(hostile: Path, first: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "path", [first.format(hostile=hostile), *sys.path])
+def test_no_process_that_is_begun_runs_a_file_of_the_current_folder(hostile: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", ["", str(hostile), *sys.path])
     assert process.in_process(from_here, str(hostile), watch=Watch()) == []
     assert list(workers.answers(from_there, [(0, str(hostile))], 1, lambda: False, None, 1.0)) == [[]]
     assert not (hostile / "mark").exists()

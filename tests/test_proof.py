@@ -24,7 +24,7 @@ from ssh_abduction.steps.apart import Continuations
 from ssh_abduction.steps.log import Log
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(machines(most_steps=30))
 def test_what_the_solver_writes_holds(trace: Trace) -> None:
     for theory in (Theory.causal(), Theory.topological().replace(star="none")) if len(trace) < 12 else (Theory.causal(),):

@@ -41,7 +41,7 @@ def agree(trace: Trace, theory: Theory) -> None:
         assert getattr(solution.cost, name) == getattr(counts, name)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.data())
 def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
@@ -67,7 +67,7 @@ def test_excuses_alone_are_minimised_where_no_pair_of_paths_can_be_excused(prefe
     agree(trace, Theory(boundary="defeasible", next_place=True, star="none", prefer=prefer))
 
 
-@settings(max_examples=25)
+@settings(max_examples=13)
 @given(st.data())
 def test_checker_rejects_what_the_brute_force_does_not_find(data: st.DataObject) -> None:
     """The maps of one theory under the axioms of another. Where these allow the map, its witnesses may still have to change."""

@@ -52,7 +52,7 @@ def circuit(steps: int, wrong: int | None = None, seen: str = "v3") -> Trace:
     )
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(small_traces(max_steps=7), st.sampled_from([0.0, 0.4, 1.0]), st.sampled_from([0.0, 0.3, 1.0]))
 def test_after_every_step_the_maps_are_those_of_brute_force(trace: Trace, misread: float, slipped: float) -> None:
     if not misread and not slipped:
@@ -70,7 +70,7 @@ def test_after_every_step_the_maps_are_those_of_brute_force(trace: Trace, misrea
             assert len(futures) == 1
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data())
 def test_what_is_known_of_steps_and_places_is_obeyed(data: st.DataObject) -> None:
     """Pairs of steps that somebody asserts, and places with stars, are more than the two causal axioms: the maps are those of solving anew, too."""

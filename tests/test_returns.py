@@ -34,7 +34,7 @@ def evidence_of(trace: Trace, **choices: object) -> Displacement:
     return Displacement.of(Theory(displacement="use", returns=64, star="none").replace(**choices))
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(st.data())
 def test_what_is_known_of_a_trace_grows_with_it(data: st.DataObject) -> None:
     """Pairs and counts; steps without a displacement are among them, and traces that go on from one prefix in two ways."""

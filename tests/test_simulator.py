@@ -78,7 +78,7 @@ def by_hand(world: World, pose: tuple[float, float, float], bearing: float, reac
     return nearest
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(st.floats(0.3, 3.7), st.floats(0.3, 1.7), st.floats(-4, 4))
 def test_ranges_are_those_computed_beam_by_beam(x: float, y: float, heading: float) -> None:
     ranges = Laser().exact(RECTANGLE, np.array([[x, y, heading]]))[0]
@@ -186,7 +186,7 @@ def test_worlds_that_are_not_there(tmp_path: Path) -> None:
 # Sight and control
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.floats(0.45, 0.75), st.floats(0.45, 0.75), st.floats(-12, 12), st.sampled_from(range(4)))
 def test_sight_measures_the_corner_that_it_sees(ahead: float, left: float, degrees: float, corner: int) -> None:
     """In a room without a notch, facing into each corner: distances to both walls, and the tilt, to a few millimetres and tenths of a degree.
@@ -212,7 +212,7 @@ def test_an_image_of_nothing_shows_nothing() -> None:
     assert (seen.front, seen.left, seen.right, seen.to_go(1.0), seen.offset(1.0)) == (None, None, None, None, None)
 
 
-@settings(max_examples=25)
+@settings(max_examples=13)
 @given(st.floats(-0.05, 0.05), st.floats(-0.012, 0.012), st.floats(-10, 10), st.integers(0, 10**6))
 def test_hill_climbing_ends_at_the_fixed_point(dx: float, dy: float, degrees: float, seed: int) -> None:
     """From anywhere near x0, along the way and in heading, the robot comes to within the tolerance of the law."""
@@ -324,7 +324,7 @@ def fixed_points(trace: Trace) -> list[tuple[float, float, float]]:
     return [(*map(float, middle[step.truth["place"]]), heading[step.truth["dstate"]]) for step in trace.steps]
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(POSES, POSES)
 def test_a_displacement_leads_from_one_pose_to_the_other(start: tuple[float, float, float], end: tuple[float, float, float]) -> None:
     x, y, heading = moved(start, between(start, end))

@@ -102,7 +102,7 @@ def test_prefixes_of_random_machines(seed: int) -> None:
     assert len(set(by_prefix.maps)) == by_prefix.count
 
 
-@settings(max_examples=16)
+@settings(max_examples=8)
 @given(traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory))))
 def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
     """Every prefix is tried, from the shortest, so that replay has all chances to go wrong."""
@@ -555,7 +555,7 @@ def shape(ssh_map: SSHMap) -> tuple[object, ...]:
     return ssh_map.labels, tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)
 
 
-@settings(max_examples=16)
+@settings(max_examples=8)
 @given(traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory))))
 def test_renaming_and_mirroring_leave_the_maps_alone(case: tuple[Trace, Theory]) -> None:
     trace, theory = case

@@ -55,7 +55,7 @@ def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
     return Trace.from_steps(seen, [("travel", "right")[action] for action in done])
 
 
-@settings(max_examples=24)
+@settings(max_examples=12)
 @given(machines(), st.sets(st.sampled_from(NAMES)), st.data())
 def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trace, off: set[str], data: st.DataObject) -> None:
     """With prefixes, patience and what is held back so small that all of it happens on short traces."""
@@ -169,7 +169,7 @@ def test_as_many_maps_as_asked_for(most: int) -> None:
     assert found.complete == (every.count <= most)
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(machines(most_steps=40))
 def test_merging_greedily_gives_a_map(trace: Trace) -> None:
     theory = Theory.causal()
@@ -179,7 +179,7 @@ def test_merging_greedily_gives_a_map(trace: Trace) -> None:
     assert check(trace, found.maps[0], theory) == ()
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(machines(most_steps=30))
 def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
     """The matrix against its definition, step by step; and the cliques against all there are, as networkx finds them."""
@@ -226,7 +226,7 @@ def test_unknown_speedups_are_an_error() -> None:
         Speedups.without("magic")
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(traces(max_steps=12))
 def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
     """So they do where each step was a dstate, and these are merged while they can be."""

@@ -249,7 +249,7 @@ def test_a_prefix_ends_without_an_action() -> None:
     assert trace.prefix(3) == trace
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(st.binary(max_size=200) | st.text(max_size=200).map(lambda text: f"{HEADER}\n{text}".encode()))
 def test_any_file_is_a_trace_or_a_clear_error(data: bytes) -> None:
     import tempfile

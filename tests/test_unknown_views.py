@@ -32,7 +32,7 @@ def hidden(trace: Trace, steps: set[int]) -> Trace:
     return trace.with_views([None if t in kept else view for t, view in enumerate(trace.views)])
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.data())
 def test_solver_and_checker_agree_with_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")
@@ -40,7 +40,7 @@ def test_solver_and_checker_agree_with_the_brute_force(data: st.DataObject) -> N
     agree(hidden(trace, steps), data.draw(theories(trace), label="theory"))
 
 
-@settings(max_examples=25)
+@settings(max_examples=13)
 @given(st.data())
 def test_to_hide_a_view_never_costs_anything(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")

@@ -43,7 +43,7 @@ def bare_theories(draw: st.DrawFn) -> Theory:
     )
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data())
 def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
     """Told of paths that an answer contradicts, or only of links that do not go together; with few names at first; a minimal map known, or not."""
@@ -68,7 +68,7 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
     assert engine.bound == best.cost[0]
 
 
-@settings(max_examples=12, deadline=None, derandomize=True)
+@settings(max_examples=6, deadline=None, derandomize=True)
 @given(st.data())
 def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.DataObject) -> None:
     """Two returns of a minimal map, to dstates or to places, are forbidden: the maps that are left are those of the readable encodings, which are told the same."""

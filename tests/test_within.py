@@ -31,7 +31,7 @@ def at(ssh_map: SSHMap) -> list[int | None]:
     return [ssh_map.dstates[label].place for label in ssh_map.labels]
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(st.data())
 def test_near_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
     """Each map once, in the order of cost, each with its own cost."""

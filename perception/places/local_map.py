@@ -180,13 +180,16 @@ def distances(open_cells: Bools, seeds: Bools, limit: float) -> Array:
     wave = np.flatnonzero(np.pad(seeds, 1).reshape(-1) & unreached)
     found = np.full(unreached.shape, np.inf)
     found[wave], unreached[wave] = 0.0, False
+    last = np.empty(unreached.shape, np.int64)
     four = np.array([-width, -1, 1, width])
     eight = np.array([-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1])
     for count in range(math.ceil(limit / (STRIDE * CELL))):
         cells = (wave[:, None] + (eight if count % 2 else four)).reshape(-1)
         cells = cells[unreached[cells]]
         unreached[cells] = False
-        wave = np.unique(cells)
+        numbers = np.arange(len(cells))
+        last[cells] = numbers
+        wave = cells[last[cells] == numbers]  # each cell once, and faster than by sorting
         if not len(wave):
             break
         found[wave] = (count + 1) * STRIDE * CELL

@@ -26,6 +26,8 @@ _log = log_of(__name__)
 FRAMING = 30.0  # Maps with frames are sought for so many seconds at most: what they are good for is mostly found by then.
 FRAMING_SHARE = 0.4  # Or for such a share of the time that is left, if that is less, so that clingo has the larger part.
 SKETCH_SHARE = 0.4  # A sketch and its check may take such a share of the time that is left for all of them.
+# The surest sketch may take this many seconds even if less time is left. Else a slow machine would leave no map at all.
+SUREST = 1.5
 UNMAPPED = 2.0  # Until there is any map that may take so many times as long, as any map is worth more than a better one.
 
 
@@ -60,7 +62,8 @@ class Candidates:
             *smaller, surest = self._attempts()
             for attempt in (surest, *smaller):
                 before, share = self._known.best, 1.0 if attempt in (surest, smaller[-1]) else SKETCH_SHARE
-                with suppress(LimitError), heeding(whole.part(share * whole.left()).check):
+                part = Watch().part(max(seconds, SUREST)) if attempt is surest else whole.part(share * whole.left())
+                with suppress(LimitError), heeding(part.check):
                     attempt()
                 if seconds < math.inf and attempt is not surest and self._known.best is not before:
                     return
