@@ -179,7 +179,7 @@ def test_a_wrong_field_of_view_is_said_with_the_likely_one(drive: tuple[Scan, ..
     """The true one is 180 degrees."""
     said = doubt(tuple(Told(fov=fov).placed(scan) for scan in drive))
     (about,) = map(float, re.findall(rf"cover about (\d+) degrees, not {fov:.0f} \(--fov\)", said))
-    assert about == pytest.approx(180, abs=12)
+    assert about == pytest.approx(180, abs=5)
     assert re.search(r"\d+ m by scans, \d+ m by odometry; turns by scans are \d\.\d\d times", said)
 
 

@@ -223,9 +223,7 @@ def test_images_at_even_distances() -> None:
 # --- maps
 
 
-@pytest.mark.parametrize(
-    ("name", "tours", "seed"), [("triangle", 2, 1), ("triangle", 1, 2), ("three-ways", 1, 3), ("five-ways", 1, 4), ("six-ways", 1, 5)]
-)
+@pytest.mark.parametrize(("name", "tours", "seed"), [("triangle", 2, 1), ("three-ways", 1, 3), ("five-ways", 1, 4), ("six-ways", 1, 5)])
 def test_the_true_map_is_found_from_what_was_simulated(name: str, tours: int, seed: int, tmp_path: Path) -> None:
     """simulate, cluster and solve, as a user would: one minimal map, and it is the true one."""
     run, views = str(tmp_path / "run.jsonl"), str(tmp_path / "views.jsonl")

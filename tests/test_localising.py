@@ -102,7 +102,7 @@ def test_a_long_trace_is_solved_from_few_of_its_visits(seed: int) -> None:
     assert check(trace, maps[0], search.theory) == ()
 
 
-@pytest.mark.parametrize(("seed", "steps", "guesses"), [(1, 700, 1), (3, 700, 2), (3, 500, 2)])
+@pytest.mark.parametrize(("seed", "steps", "guesses"), [(1, 700, 1), (3, 500, 2)])
 def test_the_beginning_of_a_long_trace_is_guessed(seed: int, steps: int, guesses: int) -> None:
     """And the rest follows from it, or twice as many visits are guessed, until all are. Either way it is a map with paths."""
     walk = maze(3, 3, steps=steps, seed=seed, stars=True)

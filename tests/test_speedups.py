@@ -263,7 +263,7 @@ def test_a_limit_leaves_a_map_of_merged_steps() -> None:
     assert check(walk.trace, solution.maps[0], Theory.causal()) == ()
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0])
 def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
     """Of a machine that does not turn."""
     walk = moore(12, 2, steps=800, seed=seed)

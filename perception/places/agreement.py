@@ -9,8 +9,8 @@ the robot at its beginning. The factor that best leads from the odometer's motio
 scans (least squares) has an angle: the robot moves in another direction by scans.
 
 Matching scans begins at the odometer's motion. So in a corridor, the way by scans hardly tells that
-the laser looks elsewhere. Pairs of scans tell it: moved as the odometer says, their points meet if
-the laser looks as it is taken to.
+the laser looks elsewhere. Pairs of scans tell it: moved as the odometer says, their points meet only
+if the laser looks as the log says. They tell the field of view in the same way.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from perception.readers.echoes import moving
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.odometry import between
 
-# A stretch ends where the robot went so many metres or turned by so many radians, by odometry.
+# A stretch ends when the robot has gone this many metres or turned by this many radians, by odometry.
 STRETCH, BEND = 1.0, math.radians(30)
-# Turns are compared in stretches that turn by so many radians, if there are so many of them.
+# Turns are compared in stretches that turn by this many radians, if there are enough of them.
 TURN, LEAST_TURNS = math.radians(15), 8
-# The ways part in a stretch if they end farther apart than this share of it and so many metres.
+# The ways part in a stretch if they end farther apart than this share of it plus this many metres.
 PARTED, ASIDE = 0.25, 0.2
 # In good logs, recorded and simulated, both ways differ by at most 4 % in length, 2 degrees in
 # direction and 6 % in turns, and they part in at most 3 % of the stretches. Matching is there to mend
@@ -41,15 +41,18 @@ PARTED, ASIDE = 0.25, 0.2
 LENGTH, ANGLE, TURNING, PARTING = 0.1, math.radians(10), 0.15, 0.05
 # A robot that was pushed or slipped once has ways that part in fewer stretches.
 LEAST_PARTED = 3
-# Pairs of scans are so many metres apart, and turned by less than so many radians. So many of them are
-# enough.
-GAP, BEND_OF_PAIR, PAIRS = (0.8, 2.4), 0.6, 60
-# Points of two scans meet up to so many metres, and those beyond so many metres do not count.
+# The scans of a pair are at least this far apart, in metres or radians, and less than that far.
+GAP, TURN_OF_PAIR = (0.8, 2.4), (0.35, 1.2)
+# This many pairs are enough.
+PAIRS = 60
+# Points farther apart than this many metres do not meet, and points farther away than that do not count.
 MEET, NEAR = 0.3, 8.0
-# The laser is turned by so many degrees at a time. In all good logs points meet best within 5 degrees of
-# the true direction, and 180 degrees away they are 2 to 4 times as far apart.
-TURNS = np.arange(-180, 180, 5)
-LEAST_TURN, CLOSER = 10, 0.75
+# The laser is turned by 5 degrees at a time, and its field of view is tried from 60 to 360 degrees. In
+# all good logs points meet best within 5 degrees of the true direction and 10 of the true field.
+TURNS, FIELDS = np.arange(-180, 180, 5), np.arange(60, 361, 10)
+# Another direction or field is likely if it differs by this many degrees, and if points are closer by
+# these factors.
+LEAST_CHANGE, CLOSER_TURNED, CLOSER_WIDENED = 10, 0.75, 0.85
 
 
 @dataclass(frozen=True)
@@ -132,19 +135,23 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
         How they differ, with the likely causes and the options that mend them. None if they agree.
     """
     found = agreement(log, track)
-    looks = None if found.has_other_turns else direction(log)
+    covers = None if found.is_good else field_of_view(log)
+    looks = direction(log) if covers is None and not found.has_other_turns else None
     if found.is_good and looks is None:
         return None
     laser = log.scans[0].laser
     differences = [f"{found.scans:.0f} m by scans, {found.odometry:.0f} m by odometry"]
     causes: list[str] = []
+    fov = _fov(log.scans[0])
     if found.turning is not None and found.has_other_turns:
         differences.append(f"turns by scans are {found.turning:.2f} times those by odometry")
-        fov = math.degrees(abs(laser.step)) * laser.steps
         if found.turning < 0:
             causes.append(f"the laser hangs upside down (--fov {-math.copysign(fov, laser.step):.0f})")
-        elif fov / found.turning <= 360:
-            causes.append(f"its beams cover about {fov / found.turning:.0f} degrees, not {fov:.0f} (--fov)")
+            covers = None
+        elif covers is None and fov / found.turning <= 360:
+            covers = fov / found.turning
+    if covers is not None:
+        causes.append(f"its beams cover about {covers:.0f} degrees, not {fov:.0f} (--fov)")
     if found.is_askew:
         degrees, side = abs(math.degrees(found.angle)), "left" if found.angle > 0 else "right"
         differences.append(f"the direction by scans is {degrees:.0f} degrees to the {side} of that by odometry")
@@ -171,30 +178,59 @@ def direction(log: RobotLog) -> float | None:
 
     None if it looks as the log says, if the scans do not tell, or if there are several lasers.
     """
-    mounts = {scan.laser.mount for scan in log.scans}
-    if len(mounts) > 1:
+    angles = {scan.laser.mount[2] for scan in log.scans}
+    apart = _apart(log, np.radians(TURNS)) if len(angles) == 1 else None
+    if apart is None:
         return None
-    x, y, angle = mounts.pop()
-    at, looks = complex(x, y), np.exp(1j * (angle + np.radians(TURNS)))
-    distances = []
+    best = int(np.argmin(apart))
+    if abs(TURNS[best]) < LEAST_CHANGE or apart[best] > CLOSER_TURNED * float(apart[TURNS == 0][0]):
+        return None
+    return math.degrees(wrapped(angles.pop() + math.radians(TURNS[best])))
+
+
+def field_of_view(log: RobotLog) -> float | None:
+    """Degrees that the beams seem to cover. None if they cover what the log says, or if the scans do not tell."""
+    fov = _fov(log.scans[0])
+    tried = [_apart(log, np.zeros(1), float(degrees) / fov) for degrees in FIELDS]
+    now = _apart(log, np.zeros(1))
+    if now is None or any(one is None for one in tried):
+        return None
+    apart = np.array([one[0] for one in tried if one is not None])
+    best = int(np.argmin(apart))
+    return float(FIELDS[best]) if abs(FIELDS[best] - fov) >= LEAST_CHANGE and apart[best] < CLOSER_WIDENED * now[0] else None
+
+
+def _fov(scan: Scan) -> float:
+    """Degrees that the beams of a scan cover, as the log says."""
+    return math.degrees(abs(scan.laser.step)) * scan.laser.steps
+
+
+def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
+    """How far apart points of pairs of scans are that are moved as the odometer says.
+
+    Args:
+        log: The scans.
+        turns: Radians by which the laser is turned on the robot, (n,).
+        stretch: How many times as wide as the log says the beams spread.
+
+    Returns:
+        Mean metres to the nearest point, (n,). None if there are too few pairs.
+    """
+    apart = []
     for first, second in _pairs(log):
+        x, y, angle = first.laser.mount
+        at, looks = complex(x, y), np.exp(1j * (angle + turns))
         dx, dy, turn = between(first.odometry, second.odometry)
-        here, there = _points(first), _points(second)
-        if not len(here) or not len(there):
+        here, there = _points(first, stretch), _points(second, stretch)
+        if first.laser != second.laser or not len(here) or not len(there):
             continue
         # From the laser of the second scan to its robot, to the robot of the first scan, and to its laser.
         moved = complex(dx, dy) + (at + there[:, None] * looks) * np.exp(1j * turn)
         seen = (moved - at) / looks
         tree = cKDTree(np.stack([here.real, here.imag], axis=-1))
         nearest, _ = tree.query(np.stack([seen.real, seen.imag], axis=-1), distance_upper_bound=MEET)
-        distances.append(np.minimum(nearest, MEET).mean(axis=0))
-    if len(distances) < PAIRS / 4:
-        return None
-    apart = np.mean(distances, axis=0)
-    best = int(np.argmin(apart))
-    if abs(TURNS[best]) < LEAST_TURN or apart[best] > CLOSER * float(apart[TURNS == 0][0]):
-        return None
-    return math.degrees(wrapped(angle + math.radians(TURNS[best])))
+        apart.append(np.minimum(nearest, MEET).mean(axis=0))
+    return np.asarray(np.mean(apart, axis=0)) if len(apart) >= PAIRS / 4 else None
 
 
 def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
@@ -204,17 +240,18 @@ def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
     for i, scan in enumerate(kept):
         for later in kept[i + 1 : i + 10]:
             dx, dy, turn = between(scan.odometry, later.odometry)
-            if math.hypot(dx, dy) >= GAP[0]:
-                if math.hypot(dx, dy) < GAP[1] and abs(turn) < BEND_OF_PAIR:
+            if math.hypot(dx, dy) >= GAP[0] or abs(turn) >= TURN_OF_PAIR[0]:
+                if math.hypot(dx, dy) < GAP[1] and abs(turn) < TURN_OF_PAIR[1]:
                     pairs.append((scan, later))
                 break
     return [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).astype(int))]
 
 
-def _points(scan: Scan) -> NDArray[np.complex128]:
+def _points(scan: Scan, stretch: float) -> NDArray[np.complex128]:
     """What the beams of a scan met, seen from the laser, as complex numbers."""
     met = (scan.ranges > 0) & (scan.ranges < min(scan.laser.reach, NEAR))
-    return np.asarray(scan.ranges[met] * np.exp(1j * scan.laser.bearings[met]))
+    middle = scan.laser.bearings.mean()
+    return np.asarray(scan.ranges[met] * np.exp(1j * (middle + stretch * (scan.laser.bearings[met] - middle))))
 
 
 def _stretches(odometry: Array) -> list[tuple[int, int]]:

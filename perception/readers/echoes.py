@@ -294,4 +294,4 @@ def _without_measurement(scans: Sequence[Scan], reach: float) -> tuple[frozenset
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %"
+    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
