@@ -28,10 +28,10 @@ from simulator.control import Tolerance
 from simulator.laser import Laser
 from simulator.tours import simulate
 from simulator.world import World
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning
 from ssh_abduction.reproduce.claims import VIEWS_ALONE, notched, one_to_one, true_dstates
 from ssh_abduction.solver.search import solve
-from ssh_abduction.trace import Trace
 
 WORLD = World.named("notched-rectangle")
 SECONDS = 2.0

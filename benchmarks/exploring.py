@@ -37,9 +37,9 @@ from truth import Known, is_true, share_all
 
 from simulator.plans import Floor, Plan
 from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.data.trace import Action, Step
 from ssh_abduction.explorer import Explorer
 from ssh_abduction.rivals.tour import Move, shortest_flow
-from ssh_abduction.trace import Action, Step
 
 ROOT = Path(__file__).parent.parent
 MOVES = {name: Action.of(name) for name in ("travel", "right", "around", "left")}

@@ -32,8 +32,8 @@ from perception.recognition import recogniser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Belief, Localiser, SSHMap, Step, Trace
+from ssh_abduction.data.maps import DState
 from ssh_abduction.localize import Verdict
-from ssh_abduction.maps import DState
 from ssh_abduction.reproduce.figures import draw_beliefs
 
 FAMILIES: dict[str, Callable[[int], Walk]] = {

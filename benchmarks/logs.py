@@ -28,7 +28,7 @@ from visited import Events, Truth, judged, truth_of
 
 from perception.readers.logs import read_log
 from ssh_abduction import Trace
-from ssh_abduction.maps import maps_of, read_json
+from ssh_abduction.data.maps import maps_of, read_json
 
 OURS = "ssh-abduction"
 # By name the poses at which scans are laid into the grid, and whether doors are nodes.

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import networkx as nx
 
 from ssh_abduction import Trace
-from ssh_abduction.trace import Action
+from ssh_abduction.data.trace import Action
 
 STRAIGHT = 20.0  # degrees: two streets that are at most so far from one line are one path
 

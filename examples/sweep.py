@@ -23,9 +23,9 @@ from statistics import median
 from typing import Any
 
 from ssh_abduction.cli import main as shell
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.solver.result import Solution
-from ssh_abduction.trace import Trace
 
 Row = dict[str, Any]
 

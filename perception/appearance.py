@@ -19,8 +19,8 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from perception.errors import PerceptionError, equal_length
 from perception.reciprocal import ReciprocalTransformer
-from ssh_abduction.errors import brief, is_finite, is_whole
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.errors import brief, is_finite, is_whole
+from ssh_abduction.data.trace import Trace
 
 Shape = tuple[int, int, int]
 # The field of a trace's header that says what shape its panoramas have.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ssh_abduction.errors import SSHError
+from ssh_abduction.data.errors import SSHError
 
 
 class PerceptionError(SSHError, ValueError):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import PerceptionError
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.trace import Trace
 
 # Bytes that a sidecar file may have once it is unpacked: a small archive may claim to hold more than the memory.
 LARGEST = 4 * 2**30

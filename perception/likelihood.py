@@ -32,7 +32,7 @@ from sklearn.pipeline import Pipeline
 
 from perception.errors import PerceptionError, equal_length
 from perception.recognition import PlaceRecognizer
-from ssh_abduction.errors import brief
+from ssh_abduction.data.errors import brief
 
 # The spread of a place's images is at least this share of the spread of all images: images without any noise, such as those of a test, are not infinitely certain.
 LEAST_SPREAD = 1e-6

@@ -15,7 +15,7 @@ from sklearn.base import BaseEstimator, OneToOneFeatureMixin, TransformerMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from perception.errors import ImageWarning, PerceptionError, equal_length
-from ssh_abduction.errors import is_finite
+from ssh_abduction.data.errors import is_finite
 
 
 class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]

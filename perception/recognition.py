@@ -23,7 +23,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.reciprocal import ReciprocalTransformer
-from ssh_abduction.errors import brief
+from ssh_abduction.data.errors import brief
 
 
 class PlaceRecognizer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]

@@ -26,8 +26,8 @@ from perception.likelihood import ImageLikelihood
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecognizer
 from perception.views import ViewClusterer
-from ssh_abduction.errors import brief, is_whole
-from ssh_abduction.files import write_file
+from ssh_abduction.data.errors import brief, is_whole
+from ssh_abduction.data.files import write_file
 
 FORMAT, VERSION = "ssh-recogniser", 1
 OURS = tuple(

@@ -27,8 +27,8 @@ from threadpoolctl import threadpool_limits
 from perception.confidence import NOISE, confidence
 from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.quality import cluster_quality, sampled, spanning_tree, trimmed_quality
-from ssh_abduction.checks import a_whole_number
-from ssh_abduction.errors import brief, is_finite
+from ssh_abduction.data.checks import a_whole_number
+from ssh_abduction.data.errors import brief, is_finite
 
 # Up to this many images all starts of k-means are made on all images. Where there are more, the starts are made on a sample of this many, so that the time for
 # them does not grow any further.

@@ -18,7 +18,7 @@ from simulator.laser import Laser
 from simulator.motion import Pose, between, moved
 from simulator.odometer import Odometer
 from simulator.world import World
-from ssh_abduction.errors import brief, is_finite
+from ssh_abduction.data.errors import brief, is_finite
 
 Array = NDArray[np.float64]
 # Metres and radians a second at which the robot drives and turns.

@@ -1,6 +1,6 @@
 """Errors of the simulator."""
 
-from ssh_abduction.errors import SSHError
+from ssh_abduction.data.errors import SSHError
 
 
 class SimulatorError(SSHError, ValueError):

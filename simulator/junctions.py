@@ -17,7 +17,7 @@ from simulator.control import LONGEST_TRAVEL, STILL, STRIDE, TRIES, Driver
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS
 from simulator.surroundings import STRAIGHT, Array, Panorama, Place, Street, apart, compass, points_of, streets_of, walls_of
-from ssh_abduction.trace import Action
+from ssh_abduction.data.trace import Action
 
 # Radians that the robot turns between two images.
 TURN = math.radians(15)

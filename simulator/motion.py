@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from ssh_abduction.odometry import Displacement, Odometry, Pose, between, moved
+from ssh_abduction.data.odometry import Displacement, Odometry, Pose, between, moved
 
 __all__ = ["DIGITS", "Pose", "between", "moved", "reported"]
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError, SimulatorWarning
-from ssh_abduction.errors import brief, named
-from ssh_abduction.files import read_at_most
+from ssh_abduction.data.errors import brief, named
+from ssh_abduction.data.files import read_at_most
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.robot import OPTIONS
-from ssh_abduction.errors import brief, is_finite
+from ssh_abduction.data.errors import brief, is_finite
 
 Array = NDArray[np.float64]
 # The largest value of a field: an odometer that is worse says nothing at all.

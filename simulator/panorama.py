@@ -23,8 +23,8 @@ from simulator.errors import SimulatorError
 from simulator.laser import meetings
 from simulator.motion import Pose
 from simulator.world import World, checked_segments, pose_of
-from ssh_abduction.checks import a_flag, a_list, a_number, a_whole_number, an_instance
-from ssh_abduction.errors import brief, is_finite, is_whole
+from ssh_abduction.data.checks import a_flag, a_list, a_number, a_whole_number, an_instance
+from ssh_abduction.data.errors import brief, is_finite, is_whole
 
 Array = NDArray[np.float64]
 # Metres above the floor: the camera, and the ceiling.

@@ -26,12 +26,12 @@ from scipy.optimize import linear_sum_assignment
 
 from simulator.errors import SimulatorError
 from simulator.motion import Pose, between, reported
-from ssh_abduction.checks import a_number, a_path, a_text, a_whole_number, all_instances, an_instance
-from ssh_abduction.errors import brief, named, printable
-from ssh_abduction.files import read_at_most
-from ssh_abduction.odometry import Odometry
-from ssh_abduction.star import Gateway as Sighted
-from ssh_abduction.trace import Action, Step, Trace
+from ssh_abduction.data.checks import a_number, a_path, a_text, a_whole_number, all_instances, an_instance
+from ssh_abduction.data.errors import brief, named, printable
+from ssh_abduction.data.files import read_at_most
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.star import Gateway as Sighted
+from ssh_abduction.data.trace import Action, Step, Trace
 
 Point = tuple[float, float]
 Leg = tuple[int, int]  # a room that the robot leaves, and the door that it goes through

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.motion import Pose, between
-from ssh_abduction.errors import brief, is_finite
-from ssh_abduction.odometry import Displacement
+from ssh_abduction.data.errors import brief, is_finite
+from ssh_abduction.data.odometry import Displacement
 
 # The systematic errors of an odometry are at most this, as a share and in radians a metre: with more the robot could not tell when it has left a place.
 WORST = 0.5

@@ -26,8 +26,8 @@ from simulator.laser import Laser
 from simulator.odometer import Odometer
 from simulator.plans import Plan
 from simulator.robot import Body, Robot
-from ssh_abduction.errors import brief, is_finite
-from ssh_abduction.words import counted
+from ssh_abduction.data.errors import brief, is_finite
+from ssh_abduction.data.words import counted
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]

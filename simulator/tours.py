@@ -23,11 +23,11 @@ from simulator.panorama import Camera
 from simulator.robot import Body, Report, Robot
 from simulator.watch import Watch
 from simulator.world import World
-from ssh_abduction.checks import a_flag, a_number, a_whole_number, an_instance
-from ssh_abduction.odometry import Covariance, Displacement
-from ssh_abduction.odometry import Odometry as Noise
-from ssh_abduction.trace import Action, Step, Trace
-from ssh_abduction.words import counted
+from ssh_abduction.data.checks import a_flag, a_number, a_whole_number, an_instance
+from ssh_abduction.data.odometry import Covariance, Displacement
+from ssh_abduction.data.odometry import Odometry as Noise
+from ssh_abduction.data.trace import Action, Step, Trace
+from ssh_abduction.data.words import counted
 
 Array = NDArray[np.float64]
 # More tours than this are a mistake: to drive them takes days, and all steps are kept in memory.

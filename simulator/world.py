@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.occupancy import FARTHEST, read_occupancy
-from ssh_abduction.checks import a_number, a_path, a_text, all_instances, an_instance, an_object, numbers, one_of
-from ssh_abduction.errors import brief, is_finite, named, printable
-from ssh_abduction.files import parse_json, read_at_most
+from ssh_abduction.data.checks import a_number, a_path, a_text, all_instances, an_instance, an_object, numbers, one_of
+from ssh_abduction.data.errors import brief, is_finite, named, printable
+from ssh_abduction.data.files import parse_json, read_at_most
 
 Array = NDArray[np.float64]
 Angles: TypeAlias = Literal["right", "any"]

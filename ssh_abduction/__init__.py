@@ -9,14 +9,15 @@ TYPE_CHECKING = False  # as in typing, which takes longer to load than all that 
 if TYPE_CHECKING:
     from typing import Any
 
+    from ssh_abduction.data.errors import LocaliserError, MapError, RangeError, SolverError, SSHError, TheoryError, TraceError
+    from ssh_abduction.data.maps import DState, Fit, Path, Pose, SSHMap
+    from ssh_abduction.data.odometry import Odometry
+    from ssh_abduction.data.trace import Action, Step, Trace
     from ssh_abduction.engines.base import Cost
-    from ssh_abduction.errors import LocaliserError, MapError, RangeError, SolverError, SSHError, TheoryError, TraceError
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, VisitsEvaluation, evaluate, evaluate_visits
     from ssh_abduction.explorer import Exploration, Explorer
     from ssh_abduction.export.formats import export_map
     from ssh_abduction.localize import Belief, Chances, Localiser
-    from ssh_abduction.maps import DState, Fit, Path, Pose, SSHMap
-    from ssh_abduction.odometry import Odometry
     from ssh_abduction.online.mapper import OnlineMapper
     from ssh_abduction.rivals.compare import Comparison, compare
     from ssh_abduction.rivals.difference import Difference, difference
@@ -31,19 +32,18 @@ if TYPE_CHECKING:
     from ssh_abduction.steps.certificate import Certificate
     from ssh_abduction.theory.speedups import Speedups
     from ssh_abduction.theory.theory import Theory
-    from ssh_abduction.trace import Action, Step, Trace
 
     __version__: str
 
 _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
-    "errors": ("LocaliserError", "MapError", "RangeError", "SSHError", "SolverError", "TheoryError", "TraceError"),
+    "data.errors": ("LocaliserError", "MapError", "RangeError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "VisitsEvaluation", "evaluate", "evaluate_visits"),
     "export.formats": ("export_map",),
     "explorer": ("Exploration", "Explorer"),
     "localize": ("Belief", "Chances", "Localiser"),
-    "maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
-    "odometry": ("Odometry",),
+    "data.maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
+    "data.odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
     "rivals.compare": ("Comparison", "compare"),
     "rivals.difference": ("Difference", "difference"),
@@ -58,7 +58,7 @@ _HOMES = {  # module: the names that it exports
     "steps.certificate": ("Certificate",),
     "theory.speedups": ("Speedups",),
     "theory.theory": ("Theory",),
-    "trace": ("Action", "Step", "Trace"),
+    "data.trace": ("Action", "Step", "Trace"),
 }
 
 __all__ = [

@@ -3,7 +3,7 @@
 import os
 import sys
 
-from ssh_abduction import program
+from ssh_abduction.data import program
 
 sys.path[:] = program.search_path()  # `python -m` puts the current folder first, and a file there is no module of Python's
 

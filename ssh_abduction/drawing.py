@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from html import escape
 from typing import TypeAlias
 
-from ssh_abduction.errors import xml_text
+from ssh_abduction.data.errors import xml_text
 
 Point: TypeAlias = tuple[float, float]
 

@@ -30,10 +30,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, TypeAlias
 
 from ssh_abduction.asp.limits import check_limit
-from ssh_abduction.checks import a_function
-from ssh_abduction.errors import TheoryError, TraceError, brief, is_whole
+from ssh_abduction.data.checks import a_function
+from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_whole
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Action, Step, Trace
+from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation import evaluate
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.online.mapper import OnlineMapper
 from ssh_abduction.rivals.explore import Experiment, next_experiment
 from ssh_abduction.rivals.machines import Seen
@@ -41,8 +43,6 @@ from ssh_abduction.rivals.tour import next_tour
 from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory, checked_theory
-from ssh_abduction.trace import Action, Step, Trace
-from ssh_abduction.words import counted
 
 # Where nothing is left to do, but the map is not proven minimal, so many times the limit of a step are spent on it.
 LONGER = 5

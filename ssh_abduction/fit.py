@@ -29,11 +29,11 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.sparse.linalg import lsqr, splu
 from scipy.special import gammaincc
 
-from ssh_abduction.clock import look_at_clock
-from ssh_abduction.maps import Fit, Pose, SSHMap
-from ssh_abduction.odometry import Odometry
+from ssh_abduction.data.clock import look_at_clock
+from ssh_abduction.data.maps import Fit, Pose, SSHMap
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.loops import turned
-from ssh_abduction.trace import Trace
 
 Array: TypeAlias = NDArray[np.float64]
 

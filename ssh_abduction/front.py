@@ -17,11 +17,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ssh_abduction.asp.limits import LimitError, Watch, check_limit
+from ssh_abduction.data.errors import TheoryError, brief, is_whole
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.engines.base import Found, Task
-from ssh_abduction.errors import TheoryError, brief, is_whole
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.theory import Theory, checked_theory
-from ssh_abduction.trace import Trace, checked_trace
 
 # Both kinds of faults are allowed where the theory names none. What they cost plays no part in a front.
 KINDS = {"misread": 1.5, "slipped": 1.5}

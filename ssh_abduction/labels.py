@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from perception.confidence import NOISE
 from perception.recognition import recogniser
-from ssh_abduction.errors import SSHError, brief, is_whole
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.data.errors import SSHError, brief, is_whole
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.result import Solution, Status
-from ssh_abduction.trace import Trace
 from ssh_abduction.traces import Traces
 
 

@@ -23,12 +23,12 @@ from scipy.optimize import linprog
 from scipy.sparse import coo_array
 from scipy.spatial.distance import pdist
 
-from ssh_abduction.checks import an_object
-from ssh_abduction.errors import MapError, brief, is_finite
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.checks import an_object
+from ssh_abduction.data.errors import MapError, brief, is_finite
+from ssh_abduction.data.trace import Trace
 
 if TYPE_CHECKING:
-    from ssh_abduction.maps import DState, Path, Pose, SSHMap
+    from ssh_abduction.data.maps import DState, Path, Pose, SSHMap
 
 Point: TypeAlias = tuple[float, float]
 Turns: TypeAlias = Mapping[str, "str | float"]

@@ -48,10 +48,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from ssh_abduction.checks import a_number
-from ssh_abduction.errors import LocaliserError, MapError, TraceError, brief, is_finite, named
-from ssh_abduction.maps import SSHMap
-from ssh_abduction.trace import Action, Step, Trace, View, checked_trace
+from ssh_abduction.data.checks import a_number
+from ssh_abduction.data.errors import LocaliserError, MapError, TraceError, brief, is_finite, named
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Action, Step, Trace, View, checked_trace
 
 if TYPE_CHECKING:
     from perception.likelihood import ImageLikelihood

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from perception.places.importing import Imported
 from perception.readers.scans import Pose, RobotLog
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.odometry import between, moved
+from ssh_abduction.data.words import counted
 from ssh_abduction.drawing import COLOURS, escaped, page, text
-from ssh_abduction.maps import SSHMap
-from ssh_abduction.odometry import between, moved
 from ssh_abduction.rungs import Rung
 from ssh_abduction.solver.result import Solution
-from ssh_abduction.words import counted
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]

@@ -17,7 +17,7 @@ from ssh_abduction.drawing import COLOURS, Point, escaped, fault_mark, page, tex
 from ssh_abduction.layout import travelled
 
 if TYPE_CHECKING:
-    from ssh_abduction.maps import DState, Pose, SSHMap
+    from ssh_abduction.data.maps import DState, Pose, SSHMap
 
 # In units of the page: the two nearest places are drawn this far apart, unless the other limits forbid it; places are at most so far from their nearest, as a rule;
 # and the whole map is at most so large.

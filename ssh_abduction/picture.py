@@ -10,13 +10,13 @@ import math
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.drawing import COLOURS, RADIUS, Point, escaped, fault_mark, page, text
 from ssh_abduction.layout import Layout, Turns, layout, located, travelled
 from ssh_abduction.metric_picture import metric_svg
-from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
-    from ssh_abduction.maps import DState, SSHMap
+    from ssh_abduction.data.maps import DState, SSHMap
 
 # In units of the page: between neighbouring places, from the middle of a place to the name of a dstate, and how far a dstate is drawn beside the line of its path.
 SPACING, DSTATE, LANE = 130.0, 38.0, 9.0

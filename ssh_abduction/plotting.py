@@ -6,13 +6,13 @@ import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+from ssh_abduction.data.errors import MapError, brief
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.drawing import ALARM, COLOURS
-from ssh_abduction.errors import MapError, brief
 from ssh_abduction.layout import Turns, layout, travelled
-from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
-    from ssh_abduction.maps import SSHMap
+    from ssh_abduction.data.maps import SSHMap
 
 # Inches between neighbouring places; and as shares of the way between the two nearest: where the mark of a dstate is, and how far beside the line of its path.
 APART, AHEAD, LANE = 0.9, 0.27, 0.07

@@ -23,16 +23,16 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 import networkx as nx
 
-from ssh_abduction.checks import a_list
-from ssh_abduction.errors import MapError, brief, is_whole, printable
+from ssh_abduction.data.checks import a_list
+from ssh_abduction.data.errors import MapError, brief, is_whole, printable
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import View
+from ssh_abduction.data.words import counted
 from ssh_abduction.layout import located
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.rivals.listing import Listing, Maps
-from ssh_abduction.trace import View
-from ssh_abduction.words import counted
 
 if TYPE_CHECKING:
-    from ssh_abduction.maps import DState, Pose
+    from ssh_abduction.data.maps import DState, Pose
 
 BY = ("actions", "places", "metres")
 # A dstate by its number, or a course of a place that no dstate of the map faces: (place, path, direction).

@@ -11,12 +11,12 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from ssh_abduction.errors import TraceError
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.data.errors import TraceError
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace, View
 
 FIELD = "runner_up"
 # Seconds that may be spent on the second map, where nothing else limits them: it is a warning, and not what was asked for.

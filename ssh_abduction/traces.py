@@ -14,9 +14,9 @@ from perception.appearance import features_of
 from perception.confidence import nearest_views
 from perception.errors import PerceptionError
 from perception.images import images_of
-from ssh_abduction.errors import TraceError, brief
+from ssh_abduction.data.errors import TraceError, brief
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.runner_up import with_runner_up
-from ssh_abduction.trace import Trace
 
 Integers = NDArray[np.intp]
 

@@ -24,10 +24,10 @@ from typing import NamedTuple, TypeAlias
 
 from brute_geometry import Geometry
 
-from ssh_abduction.maps import SSHMap
-from ssh_abduction.star import Gateway, Openings, Star
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.star import Gateway, Openings, Star
+from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Action, Step, Trace
 
 Labels: TypeAlias = tuple[int, ...]
 Places: TypeAlias = tuple[int | None, ...]

@@ -13,9 +13,9 @@ from itertools import combinations
 import numpy as np
 from scipy.stats import chi2
 
-from ssh_abduction.odometry import Odometry
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 LITTLE = 1e-6
 

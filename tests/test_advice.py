@@ -88,9 +88,9 @@ def test_advice_names_options_that_the_verb_has(folder: str) -> None:
     [
         ("ssh_abduction/cli/mapping.py", "set --memory-limit, or map fewer", ["--memory-limit"]),
         ("ssh_abduction/cli/batch.py", "set --memory-limit, or solve fewer", []),
-        ("ssh_abduction/maps.py", "write it with solve --json", []),
-        ("ssh_abduction/maps.py", "list fewer (map --within)", ["--within"]),
-        ("ssh_abduction/maps.py", "list fewer (--maps)", ["--maps"]),
+        ("ssh_abduction/data/maps.py", "write it with solve --json", []),
+        ("ssh_abduction/data/maps.py", "list fewer (map --within)", ["--within"]),
+        ("ssh_abduction/data/maps.py", "list fewer (--maps)", ["--maps"]),
         ("ssh_abduction/cli/route.py", "solve with --theory topological, or take --by metres", []),
     ],
 )

@@ -20,6 +20,7 @@ from benchmarks.instances import maze
 from ssh_abduction import Odometry, OnlineMapper, Search, Status, Theory, Trace, difference, solve
 from ssh_abduction.asp.limits import Watch
 from ssh_abduction.cli import main
+from ssh_abduction.data.words import counted
 from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.engines.frameless import FramelessEngine
 from ssh_abduction.engines.stepwise import StepEngine
@@ -27,7 +28,6 @@ from ssh_abduction.solver import prefixes
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.result import summary_of
 from ssh_abduction.solver.sharing import Backbone, Shared
-from ssh_abduction.words import counted
 
 ACES3 = "examples/aces3-route.jsonl"
 LIMIT = 100  # seconds: a search that does not end is a failure, not a hang

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from brute_force import consistent_maps, key, minimal_maps
 
-from ssh_abduction.maps import DState, Path, SSHMap
+from ssh_abduction.data.maps import DState, Path, SSHMap
+from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Trace
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import STANDARD_ACTIONS, Action, Trace
 
 LETTERS = {
     "T": STANDARD_ACTIONS["travel"],

@@ -11,8 +11,8 @@ import pytest
 from worlds import rectangle
 
 from ssh_abduction import DState, SSHMap, Theory, Trace, solve
-from ssh_abduction.cards import ROWS
-from ssh_abduction.maps import DRAWN
+from ssh_abduction.data.cards import ROWS
+from ssh_abduction.data.maps import DRAWN
 from ssh_abduction.solver.search import Search
 
 ACES = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")

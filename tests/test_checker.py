@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssh_abduction.data.maps import DState, Path, SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.judge.checker import AXIOMS, COHERENCE, Violation, check
-from ssh_abduction.maps import DState, Path, SSHMap
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 ACTIONS = {"T": "travel", "R": "right", "L": "left", "A": "around"}
 ALL_OPEN = (1, 1, 1, 1)

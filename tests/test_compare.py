@@ -28,8 +28,8 @@ from ssh_abduction import Comparison, Listing, MapError, SSHMap, Theory, Trace, 
 from ssh_abduction.cli import main
 from ssh_abduction.cli import solve as solving
 from ssh_abduction.cli.text import compared
+from ssh_abduction.data.maps import DState, Fault, Fit, Path
 from ssh_abduction.engines import framed, naming
-from ssh_abduction.maps import DState, Fault, Fit, Path
 from ssh_abduction.rivals.compare import Matter, Question
 from ssh_abduction.rivals.factors import deciding, independent
 from ssh_abduction.rivals.table import Table

@@ -11,7 +11,7 @@ import pytest
 from worlds import HEADINGS, TEE, Streets, streets
 
 from ssh_abduction import Action, Exploration, Explorer, Status, Step, Theory, TheoryError, TraceError, solve
-from ssh_abduction.errors import SSHError
+from ssh_abduction.data.errors import SSHError
 
 TURNS = {"right": 1, "around": 2, "left": 3}
 CORRIDOR = streets(("a", "E", "b"), ("b", "E", "c"))

@@ -24,8 +24,8 @@ from perception.recognition import PlaceRecognizer, recogniser
 from perception.store import save
 from ssh_abduction import Belief, Chances, Localiser, LocaliserError, MapError, SSHMap, Step, Theory, Trace, TraceError, solve
 from ssh_abduction.cli import main
+from ssh_abduction.data.maps import DState
 from ssh_abduction.localize import COLLAPSED, Verdict
-from ssh_abduction.maps import DState
 
 Array = np.ndarray[Any, Any]
 

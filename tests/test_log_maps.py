@@ -28,11 +28,11 @@ from ssh_abduction.asp import workers
 from ssh_abduction.cli import batch, main
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.simulate import scans_of
+from ssh_abduction.data.odometry import between
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.log_maps import SPEED, map_log, seconds_left
-from ssh_abduction.odometry import between
 from ssh_abduction.solver.result import Solution, Status
-from ssh_abduction.trace import Trace
 
 LINES = 620  # three for each scan
 REAL = Path(__file__).parents[2] / "shared" / "data" / "logs"

@@ -22,8 +22,8 @@ from perception import store
 from perception.recognition import recogniser
 from ssh_abduction import SSHMap, Trace, solve
 from ssh_abduction.cli import main
-from ssh_abduction.errors import TraceError
-from ssh_abduction.files import write_file
+from ssh_abduction.data.errors import TraceError
+from ssh_abduction.data.files import write_file
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ACES = str(EXAMPLES / "aces3-route.jsonl")

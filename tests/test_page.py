@@ -38,8 +38,8 @@ from ssh_abduction import (
 from ssh_abduction.asp.process import _under_way
 from ssh_abduction.cli import main
 from ssh_abduction.cli.options import add_theory, flags_of, theory_of
-from ssh_abduction.maps import Fault, Fit, Pose
-from ssh_abduction.maps import Path as MapPath
+from ssh_abduction.data.maps import Fault, Fit, Pose
+from ssh_abduction.data.maps import Path as MapPath
 from ssh_abduction.rivals.assumed import assumptions
 from ssh_abduction.rivals.explain import explain_pair
 from ssh_abduction.rivals.page import html

@@ -26,9 +26,9 @@ from simulator.panorama import CEILING, EYE, STEEPEST, Camera, Light, Paint
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.cli import main
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.learner import BootstrapLearner
 from ssh_abduction.reproduce.claims import VIEWS_ALONE, one_to_one, true_dstates
-from ssh_abduction.trace import Trace
 
 ROOM = World.named("notched-rectangle")
 SMALL = Camera(rows=12, columns=60, paint=Paint(5, repeated=True), hours=(7.0, 19.0))

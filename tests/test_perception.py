@@ -37,7 +37,7 @@ from perception.quality import cluster_quality, cluster_spread, spanning_tree, t
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecognizer, learning_curve, recogniser
 from perception.views import ViewClusterer, as_view_clusterer
-from ssh_abduction.errors import SSHError
+from ssh_abduction.data.errors import SSHError
 
 Images = np.ndarray[Any, Any]
 

@@ -16,8 +16,8 @@ from worlds import TOURS, drive
 
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
-from ssh_abduction.maps import DState, Fit, Pose
-from ssh_abduction.maps import Path as Street
+from ssh_abduction.data.maps import DState, Fit, Pose
+from ssh_abduction.data.maps import Path as Street
 from ssh_abduction.picture import svg
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -17,10 +17,11 @@ from unittest.mock import patch
 import pytest
 from aces import ACES
 
-from ssh_abduction import Solution, SSHError, Theory, Trace, program
+from ssh_abduction import Solution, SSHError, Theory, Trace
 from ssh_abduction.asp import process, workers
 from ssh_abduction.asp.limits import Watch
 from ssh_abduction.cli import main
+from ssh_abduction.data import program
 from ssh_abduction.log_maps import LogMapping
 from ssh_abduction.reproduce import report
 from ssh_abduction.rungs import UnderWay

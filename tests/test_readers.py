@@ -21,9 +21,9 @@ from perception.readers.lines import LONGEST_LINE
 from perception.readers.logs import FORMATS, read_log, stream_log
 from perception.readers.scans import Damage, Laser, Pose, RobotLog, Scan
 from perception.readers.writers import write_bag, write_carmen
-from ssh_abduction.errors import TraceError
-from ssh_abduction.odometry import between, moved
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.errors import TraceError
+from ssh_abduction.data.odometry import between, moved
+from ssh_abduction.data.trace import Trace
 
 LOGS = Path(__file__).parents[2] / "shared" / "data" / "logs"
 LASER = Laser(first=-math.pi / 2, step=math.pi / 180, beams=181, reach=8.0, mount=(0.2, 0.0, 0.0))

@@ -21,12 +21,12 @@ import pytest
 
 from ssh_abduction import log_maps
 from ssh_abduction.cli import main, parser
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.picture import svg
 from ssh_abduction.solver.result import Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"

@@ -11,7 +11,7 @@ from worlds import rectangle
 
 from ssh_abduction import MapError, SSHMap, Theory, Trace, route, solve
 from ssh_abduction.cli import main
-from ssh_abduction.maps import DState, Fit, Path, Pose
+from ssh_abduction.data.maps import DState, Fit, Path, Pose
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssh_abduction import Action, Step, Trace, TraceError
-from ssh_abduction import trace as trace_module
-from ssh_abduction.odometry import Odometry
+from ssh_abduction.data import trace as trace_module
+from ssh_abduction.data.odometry import Odometry
 
 HEADER = '{"format": "ssh-trace", "version": 1}'
 STEP = '{"view": "a", "action": "travel"}'

@@ -14,7 +14,7 @@ from worlds import TOURS, drive
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
-from ssh_abduction.errors import TraceError
+from ssh_abduction.data.errors import TraceError
 from ssh_abduction.judge.checker import check
 from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.rivals.compare import compare

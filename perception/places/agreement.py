@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from perception.places.track import Array, Track, wrapped
 from perception.readers.echoes import moving
 from perception.readers.scans import RobotLog, Scan
-from ssh_abduction.odometry import between
+from ssh_abduction.data.odometry import between
 
 # A stretch ends when the robot has gone this many metres or turned by this many radians, by odometry.
 STRETCH, BEND = 1.0, math.radians(30)

@@ -26,9 +26,9 @@ from perception.places.visits import Visit, find_visits
 from perception.readers.scans import RobotLog
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
-from ssh_abduction.errors import named
-from ssh_abduction.logs import log_of
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.errors import named
+from ssh_abduction.data.logs import log_of
+from ssh_abduction.data.trace import Trace
 
 _log = log_of("ssh_abduction.perception.places")
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from perception.readers.poses import Track as Odometry
 from perception.readers.poses import sources_of
 from perception.readers.scans import Pose, RobotLog, Scan
-from ssh_abduction.odometry import between
+from ssh_abduction.data.odometry import between
 
 if TYPE_CHECKING:
     from perception.places.track import Track

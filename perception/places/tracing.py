@@ -14,9 +14,9 @@ from perception.places.scale import Scale
 from perception.places.track import Array, Track, wrapped
 from perception.places.visits import Visit, Way
 from perception.readers.scans import Pose, RobotLog
-from ssh_abduction.odometry import Covariance, Odometry, between, moved
-from ssh_abduction.star import Gateway
-from ssh_abduction.trace import Action, Step, Trace
+from ssh_abduction.data.odometry import Covariance, Odometry, between, moved
+from ssh_abduction.data.star import Gateway
+from ssh_abduction.data.trace import Action, Step, Trace
 
 QUARTER = math.pi / 2
 # A way out that is farther than this from all quarters, in radians, fits no right angle.

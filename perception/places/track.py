@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from perception.places.jumps import Unknown, unknown_steps
 from perception.readers.scans import Pose, RobotLog, Scan
-from ssh_abduction.odometry import between, moved
+from ssh_abduction.data.odometry import between, moved
 
 Array = NDArray[np.float64]
 

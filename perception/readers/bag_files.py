@@ -16,7 +16,7 @@ from typing import IO, Any
 from perception.errors import LogError
 from perception.readers.lines import copied, damages, is_full, no_room, packer, unpacked
 from perception.readers.salvage import Salvage
-from ssh_abduction.errors import named
+from ssh_abduction.data.errors import named
 
 # How a file begins, and what its name has to end in for rosbags.
 MAGICS = {b"#ROSBAG V": ("ros1", ".bag"), b"\x89MCAP0\r\n": ("mcap", ".mcap"), b"SQLite format 3\0": ("ros2", ".db3")}

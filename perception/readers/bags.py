@@ -30,8 +30,8 @@ from perception.readers import bag_files
 from perception.readers.bag_files import cause
 from perception.readers.poses import Poses, Track, clock_of, sources_of
 from perception.readers.scans import Damage, Laser, Pose, Reading, Scan
-from ssh_abduction.errors import brief, named
-from ssh_abduction.odometry import between, moved
+from ssh_abduction.data.errors import brief, named
+from ssh_abduction.data.odometry import between, moved
 
 SCANS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan")
 ODOMETRY = ("nav_msgs/msg/Odometry",)

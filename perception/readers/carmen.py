@@ -59,8 +59,8 @@ from perception.readers.messages import (
     words,
 )
 from perception.readers.scans import Damage, Laser, Reading, Scan
-from ssh_abduction.files import LINE_OF_A_LOG
-from ssh_abduction.odometry import Pose, between, moved
+from ssh_abduction.data.files import LINE_OF_A_LOG
+from ssh_abduction.data.odometry import Pose, between, moved
 
 # What the poses of the scans are, in the order in which the head of this module names it; `lines` where scans have none, but ODOM lines are between them.
 Meaning: TypeAlias = Literal["edges", "restarts", "first corrected", "raw", "lines"]

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from perception.errors import LogError
 from perception.readers.scans import Scan
-from ssh_abduction.errors import brief, is_finite
-from ssh_abduction.odometry import Pose, between
+from ssh_abduction.data.errors import brief, is_finite
+from ssh_abduction.data.odometry import Pose, between
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.odometry import Pose, between, moved
+from ssh_abduction.data.odometry import Pose, between, moved
 
 # Two poses are the same up to such a difference in metres and radians: numbers in a log are rounded.
 ROUNDED = 2e-3

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 from perception.errors import LogError
-from ssh_abduction.errors import named
+from ssh_abduction.data.errors import named
 
 # What is longer is no line of a log: a scan of 10,000 beams is 100 kB.
 LONGEST_LINE = 2**20

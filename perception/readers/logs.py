@@ -13,9 +13,9 @@ from perception.readers import bag_files, bags, carmen
 from perception.readers.echoes import Told, as_told, understood
 from perception.readers.lines import LONGEST_LINE, lines, opened
 from perception.readers.scans import Damage, Reading, RobotLog, Scan
-from ssh_abduction.errors import brief, named
-from ssh_abduction.logs import log_of
-from ssh_abduction.odometry import Pose
+from ssh_abduction.data.errors import brief, named
+from ssh_abduction.data.logs import log_of
+from ssh_abduction.data.odometry import Pose
 
 _log = log_of("ssh_abduction.perception.readers")
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.readers.lines import LONGEST_LINE
-from ssh_abduction.errors import brief
-from ssh_abduction.odometry import Pose
+from ssh_abduction.data.errors import brief
+from ssh_abduction.data.odometry import Pose
 
 # Kinds of scans, the best first, as many logs hold each scan more than once: those that say how the laser is made and where it was, then those that lack one of these.
 KINDS = ("ROBOTLASER1", "FLASER", "RAWLASER1")

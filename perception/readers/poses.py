@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.odometry import Pose
+from ssh_abduction.data.odometry import Pose
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.odometry import Pose
-from ssh_abduction.words import counted
+from ssh_abduction.data.odometry import Pose
+from ssh_abduction.data.words import counted
 
 __all__ = ["Damage", "Laser", "Pose", "Reading", "RobotLog", "Scan"]
 

@@ -33,9 +33,9 @@ from numpy.typing import NDArray
 
 from perception.errors import LogError
 from perception.readers.scans import Laser, Scan
-from ssh_abduction.errors import named
-from ssh_abduction.files import write_file
-from ssh_abduction.odometry import Pose, between, moved
+from ssh_abduction.data.errors import named
+from ssh_abduction.data.files import write_file
+from ssh_abduction.data.odometry import Pose, between, moved
 
 HEADER = (
     "# message formats defined: PARAM ODOM TRUEPOS ROBOTLASER1\n"

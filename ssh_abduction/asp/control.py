@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import clingo
 
 from ssh_abduction.asp.limits import POLL, LimitError, Watch, peak_memory
-from ssh_abduction.logs import log_of
+from ssh_abduction.data.logs import log_of
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import Speedups
 

@@ -15,15 +15,15 @@ from typing import TypeAlias
 
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 
-from ssh_abduction.maps import FAULTS, DState, Fault, Path, SSHMap
-from ssh_abduction.odometry import in_words
+from ssh_abduction.data.maps import FAULTS, DState, Fault, Path, SSHMap
+from ssh_abduction.data.odometry import in_words
+from ssh_abduction.data.trace import Action, Trace, View
 from ssh_abduction.steps import frames
 from ssh_abduction.steps.chart import Chart, FramedChart
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality, Pairs, evidence_of
 from ssh_abduction.theory.speedups import TRAVELS_AND_TURNS
 from ssh_abduction.theory.theory import EXCUSED, Count, Theory
-from ssh_abduction.trace import Action, Trace, View
 
 _COURSE = {"pos": 1, "neg": -1}
 

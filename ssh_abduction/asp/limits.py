@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Literal, TypeAlias
 
-from ssh_abduction.errors import SolverError, brief, is_finite
+from ssh_abduction.data.errors import SolverError, brief, is_finite
 
 # The search for minimal maps of prefixes ends when this share of the time limit is left. Until then it may have no map of the whole trace, and the rest of the
 # time is for finding one, minimal or not.

@@ -21,10 +21,10 @@ from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Control
 from ssh_abduction.asp.limits import POLL
 from ssh_abduction.asp.rules import read_by
-from ssh_abduction.clock import look_at_clock
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.data.clock import look_at_clock
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 # What rules may read of a map and of a trace, if a map alone is to say whether they hold.
 SHOWN = frozenset({"is", "same", "at", "same_place", "along", "same_course", "on_some_path", "on", "before", "travel", "turn"})

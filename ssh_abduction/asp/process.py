@@ -18,7 +18,7 @@ from contextlib import suppress
 from typing import TypeVar
 
 from ssh_abduction.asp.limits import POLL, LimitError, Watch
-from ssh_abduction.program import command, search_path
+from ssh_abduction.data.program import command, search_path
 
 Result = TypeVar("Result")
 

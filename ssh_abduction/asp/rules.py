@@ -15,7 +15,7 @@ from functools import lru_cache
 import clingo
 from clingo import ast
 
-from ssh_abduction.errors import TheoryError
+from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory

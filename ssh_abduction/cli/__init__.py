@@ -18,7 +18,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, NoReturn
 
-from ssh_abduction import program
 from ssh_abduction.cli import (
     check,
     cluster,
@@ -45,7 +44,8 @@ from ssh_abduction.cli import (
 from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.verbosity import add_verbosity, telling
-from ssh_abduction.errors import SSHError, named, printable
+from ssh_abduction.data import program
+from ssh_abduction.data.errors import SSHError, named, printable
 
 EXIT_ERROR = 1
 MENDS = {

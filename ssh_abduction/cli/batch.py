@@ -42,15 +42,15 @@ from ssh_abduction.cli.outcome import (
     warnings_of,
 )
 from ssh_abduction.cli.text import headline
-from ssh_abduction.errors import SolverError, SSHError, brief, named, printable
+from ssh_abduction.data.errors import SolverError, SSHError, brief, named, printable
+from ssh_abduction.data.program import SIGNALLED, interrupted_code
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain import Explanation
-from ssh_abduction.program import SIGNALLED, interrupted_code
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
     from distributed import Client, Future

@@ -12,11 +12,11 @@ from pathlib import Path
 from ssh_abduction.cli.options import Verbs, add_output, check_picture, picture_file, seed, write
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.errors import SSHError
+from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.runner_up import SECONDS, runner_up, second_map, with_runner_up
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 
 def add_parser(verbs: Verbs) -> None:

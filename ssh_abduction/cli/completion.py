@@ -6,7 +6,7 @@ import argparse
 import re
 
 from ssh_abduction.cli.options import Verbs
-from ssh_abduction.errors import SSHError
+from ssh_abduction.data.errors import SSHError
 
 SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.options import Verbs, read_maps
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.errors import MapError, named
-from ssh_abduction.files import json_line
-from ssh_abduction.maps import maps_of
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.errors import MapError, named
+from ssh_abduction.data.files import json_line
+from ssh_abduction.data.maps import maps_of
+from ssh_abduction.data.trace import Trace
 
 if TYPE_CHECKING:
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, MapPairs, VisitsEvaluation

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ssh_abduction.cli.options import Verbs, output
 from ssh_abduction.cli.text import counted
-from ssh_abduction.errors import SSHError, named
-from ssh_abduction.files import shipped, write_file
+from ssh_abduction.data.errors import SSHError, named
+from ssh_abduction.data.files import shipped, write_file
 
 
 def add_parser(verbs: Verbs) -> None:

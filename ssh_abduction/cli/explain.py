@@ -9,12 +9,12 @@ from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, read_maps, theory_of
 from ssh_abduction.cli.outcome import dump, on_ctrl_c
-from ssh_abduction.errors import MapError, SSHError, named
-from ssh_abduction.program import interrupted_code
+from ssh_abduction.data.errors import MapError, SSHError, named
+from ssh_abduction.data.program import interrupted_code
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.rivals.explain import PairExplanation, PairQuestion, TraceExplanation, TraceQuestion, Verdict
 from ssh_abduction.solver.recorded import theory_in
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
 

@@ -7,8 +7,8 @@ import sys
 
 from ssh_abduction.asp.facts import program
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
-from ssh_abduction.errors import printable
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.errors import printable
+from ssh_abduction.data.trace import Trace
 
 
 def add_parser(verbs: Verbs) -> None:

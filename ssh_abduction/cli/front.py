@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction import program
 from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.outcome import dump
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.errors import SSHError
+from ssh_abduction.data import program
+from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.front import Front, fault_front
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 
 def run(options: argparse.Namespace) -> int:

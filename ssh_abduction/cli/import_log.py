@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, add_output, write
 from ssh_abduction.cli.text import counted
-from ssh_abduction.errors import SSHError, named
+from ssh_abduction.data.errors import SSHError, named
 
 if TYPE_CHECKING:
     from perception.readers.scans import RobotLog

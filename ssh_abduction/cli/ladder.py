@@ -12,9 +12,9 @@ from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.outcome import on_ctrl_c
 from ssh_abduction.cli.text import table
-from ssh_abduction.files import json_line
-from ssh_abduction.program import interrupted_code
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.files import json_line
+from ssh_abduction.data.program import interrupted_code
+from ssh_abduction.data.trace import Trace
 
 if TYPE_CHECKING:
     from ssh_abduction.rungs import Rung

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, check_number, check_picture, picture_file, read_maps
 from ssh_abduction.cli.text import table
-from ssh_abduction.errors import LocaliserError, MapError, named
-from ssh_abduction.files import json_line
-from ssh_abduction.maps import maps_of
+from ssh_abduction.data.errors import LocaliserError, MapError, named
+from ssh_abduction.data.files import json_line
+from ssh_abduction.data.maps import maps_of
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.sharing import stretches
-from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
     from ssh_abduction.localize import Localiser

@@ -30,9 +30,9 @@ from ssh_abduction.cli.import_log import doors_of, named_after, reading_of
 from ssh_abduction.cli.options import choices_of, theory_of
 from ssh_abduction.cli.outcome import exit_code, on_ctrl_c, warn
 from ssh_abduction.cli.text import counted
-from ssh_abduction.errors import SolverError, SSHError, named
-from ssh_abduction.files import write_file
-from ssh_abduction.program import SIGNALLED, interrupted_code
+from ssh_abduction.data.errors import SolverError, SSHError, named
+from ssh_abduction.data.files import write_file
+from ssh_abduction.data.program import SIGNALLED, interrupted_code
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

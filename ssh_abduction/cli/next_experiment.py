@@ -11,12 +11,12 @@ from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.text import table
-from ssh_abduction.errors import MapError, named, printable
-from ssh_abduction.files import json_line
-from ssh_abduction.maps import maps_of, read_json
-from ssh_abduction.program import interrupted_code
+from ssh_abduction.data.errors import MapError, named, printable
+from ssh_abduction.data.files import json_line
+from ssh_abduction.data.maps import maps_of, read_json
+from ssh_abduction.data.program import interrupted_code
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.consequences import Consequence

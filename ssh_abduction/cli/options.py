@@ -11,10 +11,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.errors import MapError, SSHError, named
-from ssh_abduction.maps import read_json
+from ssh_abduction.data.errors import MapError, SSHError, named
+from ssh_abduction.data.maps import read_json
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.theory import ASSERTIONS, CHOICES, COUNTS, EXCUSED, PRESETS, SETTLED, Theory
-from ssh_abduction.trace import Trace
 
 Verbs = Any  # argparse's type for what add_subparsers returns is private
 

@@ -11,11 +11,11 @@ from itertools import zip_longest
 from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
-from ssh_abduction import program
+from ssh_abduction.data import program
+from ssh_abduction.data.files import json_line
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.engines.base import Cost
 from ssh_abduction.explain import Explanation, Interrupted, explain
-from ssh_abduction.files import json_line
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.runner_up import second_map
 from ssh_abduction.solver import Search, Solution, Status, result
 from ssh_abduction.solver.sharing import Backbone

@@ -10,7 +10,7 @@ from typing import Any
 
 from ssh_abduction.cli.options import Verbs, output
 from ssh_abduction.cli.text import table
-from ssh_abduction.errors import SSHError, brief, named
+from ssh_abduction.data.errors import SSHError, brief, named
 
 MOST_SEEDS = 10_000  # a seed takes seconds: more are surely a slip of the hand, and would fill the memory before the first is run
 

@@ -6,8 +6,8 @@ import argparse
 
 from ssh_abduction.cli.options import Verbs
 from ssh_abduction.cli.text import course, table
-from ssh_abduction.errors import MapError, printable
-from ssh_abduction.files import json_line
+from ssh_abduction.data.errors import MapError, printable
+from ssh_abduction.data.files import json_line
 
 
 def add_parser(verbs: Verbs) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.options import Verbs, add_output, seed, write
 from ssh_abduction.cli.text import counted
-from ssh_abduction.errors import SSHError, named, printable
+from ssh_abduction.data.errors import SSHError, named, printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from perception.readers.scans import Scan
     from simulator.drive import Drive
     from simulator.panorama import Camera
-    from ssh_abduction.trace import Trace
+    from ssh_abduction.data.trace import Trace
 
 ENDINGS = (".log", ".clf", ".bag", ".mcap")
 SHIPPED = ("notched-rectangle", "taylor-hall", "triangle", "three-ways", "five-ways", "six-ways", "curved", "cluttered", "doors")
@@ -136,7 +136,7 @@ def _write_log(options: argparse.Namespace, drive: Drive) -> int:
     from pathlib import Path
 
     from perception.readers.writers import write_bag, write_carmen
-    from ssh_abduction.files import write_file
+    from ssh_abduction.data.files import write_file
 
     target = Path(options.output)
     if options.log == "carmen":
@@ -194,7 +194,7 @@ def _with_table(trace: Trace, target: str) -> Trace:
 
     import numpy as np
 
-    from ssh_abduction.files import write_file
+    from ssh_abduction.data.files import write_file
 
     path = Path(target).with_suffix(".npz")
     packed = io.BytesIO()

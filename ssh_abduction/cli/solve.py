@@ -29,14 +29,14 @@ from ssh_abduction.cli.outcome import (
     warnings_of,
 )
 from ssh_abduction.cli.text import by_displacements, compared, describe, describe_backbone, headline
+from ssh_abduction.data.logs import PROGRESS
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain import Explanation
-from ssh_abduction.logs import PROGRESS
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.result import Progress, Solution, Status, summary_of
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
-from ssh_abduction.trace import Trace
 
 # So many maps are compared on the terminal, at most, and so many are put in order in JSON: of more the first ones found are compared, and all are printed as found.
 HELD = 1000

@@ -9,9 +9,9 @@ from typing import Any
 
 from ssh_abduction.cli.options import Verbs, check_number, check_picture, output, picture_file, seed
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.errors import MapError, named
-from ssh_abduction.maps import SSHMap, maps_of, read_json
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.errors import MapError, named
+from ssh_abduction.data.maps import SSHMap, maps_of, read_json
+from ssh_abduction.data.trace import Trace
 
 
 def add_parser(verbs: Verbs) -> None:

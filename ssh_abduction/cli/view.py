@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, flags_of
-from ssh_abduction.errors import MapError, SSHError, brief, is_whole, named
+from ssh_abduction.data.errors import MapError, SSHError, brief, is_whole, named
 
 if TYPE_CHECKING:
+    from ssh_abduction.data.trace import Trace
     from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.rivals.page.content import Called, Run
     from ssh_abduction.theory.theory import Theory
-    from ssh_abduction.trace import Trace
 
 
 ASSUMING = 3.0  # For so many seconds it is sought what assumptions cost that the page may be asked about.
@@ -44,12 +44,12 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.maps import read_json
+    from ssh_abduction.data.maps import read_json
+    from ssh_abduction.data.trace import Trace
     from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.rivals.page.content import Called, content_of  # which loads numpy
     from ssh_abduction.rivals.page.html import Page
     from ssh_abduction.theory.theory import Theory
-    from ssh_abduction.trace import Trace
 
     if options.serve and options.trace is None:
         raise SSHError("--serve: expected the trace that was mapped, got none; give it after the maps")
@@ -98,8 +98,8 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
 
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
     """The run that is localised, if one was asked for. Raises SSHError."""
+    from ssh_abduction.data.trace import Trace
     from ssh_abduction.rivals.page.content import Run
-    from ssh_abduction.trace import Trace
 
     if options.localize is None and options.belief is None:
         return None
@@ -115,7 +115,7 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
 
 def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     """The run with the beliefs in a file. Raises MapError."""
-    from ssh_abduction.maps import maps_of, read_json
+    from ssh_abduction.data.maps import maps_of, read_json
     from ssh_abduction.rivals.page.content import Run
 
     told = read_json(file)
@@ -148,8 +148,8 @@ def _serve(
 ) -> int:
     import signal
 
-    from ssh_abduction import program
     from ssh_abduction.asp.process import end_all
+    from ssh_abduction.data import program
     from ssh_abduction.rivals.page.server import PageServer
 
     try:

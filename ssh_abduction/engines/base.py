@@ -8,13 +8,13 @@ from typing import Protocol
 
 from ssh_abduction.asp.control import Asker, has_processors
 from ssh_abduction.asp.limits import Watch
+from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.engines.doubts import Settled
-from ssh_abduction.maps import SSHMap, checked_map
 from ssh_abduction.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
-from ssh_abduction.trace import Trace
 
 # An engine with a chart tries a prefix of so many steps before one of AT_ONCE steps: most traces are settled by then.
 FIRST_PREFIXES = 32

@@ -14,7 +14,7 @@ import clingo
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.data.maps import SSHMap
 
 Answer = TypeVar("Answer")
 Sort: TypeAlias = Literal["dstates", "places", "paths", "courses"]

@@ -25,10 +25,10 @@ import clingo
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker, Control
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.engines.base import Found, Task
 from ssh_abduction.engines.blocks import Blocks
 from ssh_abduction.guesses.robust import Explained, Explainer, Machine, robust_maps
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.evidence import Equality
 
 LONG = 1000  # A trace of so many steps is bounded by blocks of it before clingo is asked.

@@ -29,6 +29,7 @@ import networkx as nx
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker, Control, mapped
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.engines.base import Found, Task, next_charted_size
 from ssh_abduction.engines.doubts import Settled
 from ssh_abduction.engines.homes import fewest_paths, homes_of
@@ -36,7 +37,6 @@ from ssh_abduction.engines.naming import NamedLabels
 from ssh_abduction.engines.paths import PREPARING
 from ssh_abduction.engines.refusing import all_accepted
 from ssh_abduction.engines.visits import smaller
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.steps.chart import Link, numbered
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality

@@ -13,14 +13,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from ssh_abduction.asp.limits import Watch
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.engines.base import Task
 from ssh_abduction.engines.framed import FramedEngine
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.steps.chart import Chart
 from ssh_abduction.steps.log import Log
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 
 def maps_with_frames(trace: Trace, theory: Theory, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:

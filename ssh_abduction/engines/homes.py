@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.asp.facts import Segments
-from ssh_abduction.clock import look_at_clock
+from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.engines.paths import pairwise_distinct
 
 

@@ -33,6 +33,7 @@ import numpy as np
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Control
 from ssh_abduction.asp.limits import Watch
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.guesses.annealing import MORE, SECONDS, attempts
 from ssh_abduction.guesses.merging import Told, first_failing, kept, merged_as_told, merged_near
 from ssh_abduction.steps.apart import Matrix, large_clique
@@ -40,7 +41,6 @@ from ssh_abduction.steps.chart import FramedChart
 from ssh_abduction.steps.localising import faced, states_of, tracked
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 # So clasp lists the answers in which no atom that is shown can be spared.
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")

@@ -9,9 +9,9 @@ import clingo
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.engines.base import Found, Task
 from ssh_abduction.engines.doubts import Doubt, Doubts
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.theory import Count

@@ -31,10 +31,10 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ssh_abduction.errors import MapError, TraceError, brief, named
-from ssh_abduction.maps import SSHMap, checked_maps
-from ssh_abduction.trace import Trace, View, checked_trace
-from ssh_abduction.words import counted
+from ssh_abduction.data.errors import MapError, TraceError, brief, named
+from ssh_abduction.data.maps import SSHMap, checked_maps
+from ssh_abduction.data.trace import Trace, View, checked_trace
+from ssh_abduction.data.words import counted
 
 
 @dataclass(frozen=True, slots=True)

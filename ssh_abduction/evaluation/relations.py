@@ -27,10 +27,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from simulator.motion import Pose, between, moved
-from ssh_abduction.errors import TraceError, brief, named
+from ssh_abduction.data.errors import TraceError, brief, named
+from ssh_abduction.data.files import read_at_most
+from ssh_abduction.data.odometry import Displacement
 from ssh_abduction.evaluation.trajectory import is_trajectory
-from ssh_abduction.files import read_at_most
-from ssh_abduction.odometry import Displacement
 
 # A file of more bytes than this holds something else.
 LARGEST = 2**28

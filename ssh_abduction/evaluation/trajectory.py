@@ -19,10 +19,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ssh_abduction.errors import TraceError, brief, is_finite, named
-from ssh_abduction.files import read_at_most
-from ssh_abduction.odometry import Pose, between, moved
-from ssh_abduction.trace import Step, Trace
+from ssh_abduction.data.errors import TraceError, brief, is_finite, named
+from ssh_abduction.data.files import read_at_most
+from ssh_abduction.data.odometry import Pose, between, moved
+from ssh_abduction.data.trace import Step, Trace
 
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 # A file of more bytes than this holds something else.

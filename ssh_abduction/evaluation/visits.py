@@ -30,14 +30,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.motion import Pose, between, moved
-from ssh_abduction.checks import an_instance
-from ssh_abduction.errors import TraceError, brief, is_finite, named
+from ssh_abduction.data.checks import an_instance
+from ssh_abduction.data.errors import TraceError, brief, is_finite, named
+from ssh_abduction.data.maps import SSHMap, checked_maps
+from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.names import checked_map
 from ssh_abduction.evaluation.relations import Relations
 from ssh_abduction.evaluation.trajectory import checked_pose, checked_time
-from ssh_abduction.maps import SSHMap, checked_maps
-from ssh_abduction.trace import Trace, checked_trace
-from ssh_abduction.words import counted
 
 # Two poses are one place if they are so near each other, in metres, unless another distance is asked for; and one dstate if their headings differ by at most so many
 # degrees, too: half of a right angle, which tells the directions of a corridor apart, and lets a robot swerve.

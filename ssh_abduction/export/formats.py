@@ -13,14 +13,14 @@ from typing import Any
 
 import networkx as nx
 
-from ssh_abduction.errors import MapError, brief, is_writable
+from ssh_abduction.data.errors import MapError, brief, is_writable
+from ssh_abduction.data.files import json_line
+from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.export.nav2 import nav2
 from ssh_abduction.export.roads import Roads
 from ssh_abduction.export.tmap2 import tmap2
-from ssh_abduction.files import json_line
 from ssh_abduction.layout import Turns, degrees_of
-from ssh_abduction.maps import SSHMap, checked_map
-from ssh_abduction.trace import Trace
 
 FORMATS = ("nav2", "tmap2", "graphml", "dot", "networkx-json")
 FOR_NAVIGATION = ("nav2", "tmap2")  # which need positions

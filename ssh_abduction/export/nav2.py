@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from ssh_abduction.data.files import json_line
 from ssh_abduction.export.roads import Road, Roads, Stop
-from ssh_abduction.files import json_line
 
 DIGITS = 4  # of coordinates, in metres
 

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from ssh_abduction.star import Openings
+from ssh_abduction.data.star import Openings
+from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.steps.chart import QUARTERS
 from ssh_abduction.theory.pairs import Pairs, pairs_in
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace, View
 
 # So many pairs of visits are compared at most; those that are furthest apart in the trace are left out first.
 MOST_PAIRS = 60_000

@@ -28,11 +28,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from ssh_abduction.maps import DState, Path, SSHMap
+from ssh_abduction.data.maps import DState, Path, SSHMap
+from ssh_abduction.data.trace import Action, Step, Trace, View
 from ssh_abduction.steps.chart import QUARTERS
 from ssh_abduction.steps.log import observation
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Action, Step, Trace, View
 
 
 class _Contradiction(Exception):  # noqa: N818 - not an error

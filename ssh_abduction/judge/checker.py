@@ -2,7 +2,7 @@
 
 >>> from ssh_abduction import Trace
 >>> from ssh_abduction.judge.checker import check
->>> from ssh_abduction.maps import DState, SSHMap
+>>> from ssh_abduction.data.maps import DState, SSHMap
 >>> from ssh_abduction.theory.theory import Theory
 >>> trace = Trace.from_steps(["a", "b"], ["travel"])
 >>> check(trace, SSHMap((0, 0), (DState(0, "a"),), ((0, "travel", 0),)), Theory.causal())
@@ -25,14 +25,14 @@ from functools import cached_property, partial
 from graphlib import CycleError, TopologicalSorter
 from typing import TypeAlias
 
-from ssh_abduction.clock import look_at_clock
-from ssh_abduction.errors import MapError, brief
+from ssh_abduction.data.clock import look_at_clock
+from ssh_abduction.data.errors import MapError, brief
+from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.data.star import Openings, Star
+from ssh_abduction.data.trace import Action, Trace, View, checked_trace
 from ssh_abduction.judge.gateways import Clash, Sight, clashes, headings, may_show_the_same
 from ssh_abduction.judge.planarity import Edges
-from ssh_abduction.maps import DState, SSHMap
-from ssh_abduction.star import Openings, Star
 from ssh_abduction.theory.theory import Theory, checked_theory
-from ssh_abduction.trace import Action, Trace, View, checked_trace
 
 COHERENCE = "map_explains_trace"
 QUARTERS = {"right": 1, "around": 2, "left": 3}

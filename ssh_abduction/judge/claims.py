@@ -1,7 +1,7 @@
 """Compares what a file of maps says of itself with the maps and the proof that are in it.
 
 >>> from ssh_abduction.judge.claims import false_claims
->>> from ssh_abduction.maps import DState, SSHMap
+>>> from ssh_abduction.data.maps import DState, SSHMap
 >>> from ssh_abduction.theory.theory import Theory
 >>> one = SSHMap((0,), (DState(0, "a"),), ())
 >>> false_claims({"status": "optimal", "count": 2, "bound": {"dstates": 1}}, [one], 1, Theory.causal(), 1)
@@ -14,8 +14,8 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from ssh_abduction.errors import brief, is_whole
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.data.errors import brief, is_whole
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.theory.theory import COUNTS, Theory
 
 STATUSES = ("optimal", "feasible", "unsatisfiable", "unknown")

@@ -1,7 +1,7 @@
 """Whether the stars seen at the places of a map can be those of one place each, where places have any number of gateways (star=gateways).
 
 >>> from ssh_abduction.judge.gateways import rotations
->>> from ssh_abduction.star import Star
+>>> from ssh_abduction.data.star import Star
 >>> corner = Star.of((0, 120)).frames[0]
 >>> min(rotations(corner, corner, 0)), max(rotations(corner, corner, 0)), rotations(corner, corner, 1)
 (0, 359, frozenset())
@@ -17,10 +17,10 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-from ssh_abduction.clock import look_at_clock
-from ssh_abduction.maps import DState
-from ssh_abduction.star import SPREAD, Frame, Star
-from ssh_abduction.trace import Action
+from ssh_abduction.data.clock import look_at_clock
+from ssh_abduction.data.maps import DState
+from ssh_abduction.data.star import SPREAD, Frame, Star
+from ssh_abduction.data.trace import Action
 
 AXIOMS = ("gateway_frame", "gateway_heading", "gateway_turn", "gateway_dstate", "gateway_path", "gateway_end")
 

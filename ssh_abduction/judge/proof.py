@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
-from ssh_abduction.errors import MapError, brief
-from ssh_abduction.trace import Step, Trace
+from ssh_abduction.data.errors import MapError, brief
+from ssh_abduction.data.trace import Step, Trace
 
 
 @dataclass(frozen=True, slots=True)

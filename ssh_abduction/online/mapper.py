@@ -59,12 +59,13 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.asp.limits import check_limit
+from ssh_abduction.data.errors import TheoryError, TraceError, brief
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.trace import Action, Step, Trace, View
 from ssh_abduction.engines.base import AT_ONCE, Cost
-from ssh_abduction.errors import TheoryError, TraceError, brief
 from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.judge.checker import check, unchecked
-from ssh_abduction.maps import SSHMap
-from ssh_abduction.odometry import Odometry
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.result import Seconds, Solution, Status
 from ssh_abduction.solver.search import ALL, Search
@@ -73,7 +74,6 @@ from ssh_abduction.theory.evidence import NO_PAIRS, Pairs, evidence_of, pairs_of
 from ssh_abduction.theory.evidence.displacement import count_returns
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
-from ssh_abduction.trace import Action, Step, Trace, View
 
 if TYPE_CHECKING:
     from ssh_abduction.online.background import MapGuess

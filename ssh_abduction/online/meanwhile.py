@@ -8,13 +8,13 @@ from functools import partial
 from ssh_abduction.asp.control import has_processors
 from ssh_abduction.asp.limits import Stop, Watch
 from ssh_abduction.asp.process import in_process
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.beside import Beside
 from ssh_abduction.solver.result import Bound, Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 MEANWHILE = 60.0  # For so many seconds a trace is solved; what it has grown to since is more worth it then.
 

@@ -31,10 +31,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ssh_abduction.data.maps import Fault, SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.engines.base import cost_as_counted
 from ssh_abduction.judge.checker import check
 from ssh_abduction.localize import Belief, Chances, Localiser
-from ssh_abduction.maps import Fault, SSHMap
 from ssh_abduction.online.meanwhile import Meanwhile, Solved, solved
 from ssh_abduction.online.rivals import Rival, Scale
 from ssh_abduction.solver.judging import Judging
@@ -43,7 +44,6 @@ from ssh_abduction.steps.log import observation
 from ssh_abduction.theory.evidence import evidence_of, pairs_of
 from ssh_abduction.theory.speedups import Speedups, row
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 RARE = Chances().misread  # How probable a fault of the cheapest kind is, at each step.
 CERTAIN = 0.99  # A map that has this probability among its rivals may be certain.

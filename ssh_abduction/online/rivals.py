@@ -22,11 +22,11 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from ssh_abduction.data.maps import DState, Fault, SSHMap
+from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.engines.base import Cost
-from ssh_abduction.maps import DState, Fault, SSHMap
 from ssh_abduction.steps.log import observation
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Step, Trace
 
 Seen = tuple[object, object]  # as `observation` returns it: the view, and the star where the theory uses stars
 DSTATE = 10  # What a dstate costs, in tenths of dstates.

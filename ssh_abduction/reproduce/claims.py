@@ -26,11 +26,11 @@ from simulator.control import STILL
 from simulator.laser import Laser
 from simulator.tours import simulate
 from simulator.world import World
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.engines.base import Cost
 from ssh_abduction.learner import BootstrapLearner
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from perception.features import TellingFeatures
 from perception.recognition import LearningCurve
 from simulator.laser import BEARINGS
 from simulator.world import World
-from ssh_abduction.errors import SSHError
-from ssh_abduction.files import write_file
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.files import write_file
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.plotting import plot
 from ssh_abduction.reproduce.claims import Outcome
 

@@ -20,10 +20,10 @@ from simulator.laser import Laser
 from simulator.robot import Body
 from simulator.tours import simulate
 from simulator.world import World
-from ssh_abduction import program
 from ssh_abduction.asp import workers
-from ssh_abduction.errors import SSHError
-from ssh_abduction.files import write_file
+from ssh_abduction.data import program
+from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.files import write_file
 from ssh_abduction.learner import BootstrapLearner
 from ssh_abduction.picture import svg
 from ssh_abduction.reproduce import figures

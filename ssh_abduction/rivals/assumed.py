@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 
 from ssh_abduction.asp import facts
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.engines.base import Cost
 from ssh_abduction.explain import Axioms, Interrupted, Piece
 from ssh_abduction.rivals.explain import SMALL, UNCUT, PairExplanation, Side, Verdict
@@ -20,7 +21,6 @@ from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver.result import Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 Pair = tuple[int, int]
 

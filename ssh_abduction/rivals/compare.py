@@ -26,8 +26,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.errors import MapError, printable
-from ssh_abduction.maps import Fault, SSHMap
+from ssh_abduction.data.errors import MapError, printable
+from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.rivals.difference import Difference, difference
 from ssh_abduction.rivals.factors import deciding, independent, options_of
 from ssh_abduction.rivals.listing import Listing, Maps

@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
-from ssh_abduction.maps import DState, SSHMap
+from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.data.star import Star
+from ssh_abduction.data.trace import Action
 from ssh_abduction.rivals.machines import Seen
-from ssh_abduction.star import Star
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Action
 
 How: TypeAlias = Literal["link", "implied", "expected", "open"]
 QUARTERS = {"right": 1, "around": 2, "left": 3}

@@ -22,12 +22,12 @@ from typing import Any
 import clingo
 
 from ssh_abduction.asp import facts
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain import Assumption, Axioms, Clash, Piece, why_apart
 from ssh_abduction.judge.checker import Violation, check, unchecked
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import EXCUSED
-from ssh_abduction.trace import Trace
 
 FEW_STEPS = 14  # An argument about so few steps may speak of all of them. In a longer piece it speaks of those that the axioms name, as conclusions are many.
 IN_A_LINE, INDENT = 2, " " * 7  # More reasons than these have a line each, with this indent.

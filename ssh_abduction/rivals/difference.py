@@ -1,6 +1,6 @@
 """What tells two maps of one trace apart.
 
->>> from ssh_abduction.maps import DState, SSHMap
+>>> from ssh_abduction.data.maps import DState, SSHMap
 >>> a, b = DState(0, "hall"), DState(1, "hall")
 >>> found = difference(SSHMap((0, 0, 1), (a, b), ()), SSHMap((0, 1, 1), (a, b), ()))
 >>> print(found)
@@ -18,10 +18,10 @@ from typing import Any, TypeAlias
 
 import networkx as nx
 
-from ssh_abduction.checks import a_list, a_text
+from ssh_abduction.data.checks import a_list, a_text
+from ssh_abduction.data.errors import MapError, brief, printable
+from ssh_abduction.data.maps import Fault, SSHMap, checked_map
 from ssh_abduction.engines.doubts import Sort
-from ssh_abduction.errors import MapError, brief, printable
-from ssh_abduction.maps import Fault, SSHMap, checked_map
 from ssh_abduction.rivals.table import NONE, Table
 from ssh_abduction.solver.sharing import stretches
 

@@ -22,15 +22,15 @@ from typing import Any
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import LimitError, Stop, Watch, check_limit
 from ssh_abduction.asp.rules import check_rules
-from ssh_abduction.checks import a_whole_number
+from ssh_abduction.data.checks import a_whole_number
+from ssh_abduction.data.errors import SolverError, SSHError, TraceError, brief, is_whole
+from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View, checked_trace
 from ssh_abduction.engines.base import Cost
-from ssh_abduction.errors import SolverError, SSHError, TraceError, brief, is_whole
 from ssh_abduction.explain import Axioms, Explanation, Interrupted, Piece, explain
 from ssh_abduction.rivals.derivation import Derivation, derive
 from ssh_abduction.solver.result import Progress, Status
 from ssh_abduction.solver.search import Search
 from ssh_abduction.theory.theory import ASSERTIONS, Theory, checked_theory
-from ssh_abduction.trace import STANDARD_ACTIONS, Action, Step, Trace, View, checked_trace
 
 SMALL = 14  # Pieces of up to so many steps are asked before the whole trace: that takes less than a second.
 LARGE = 40  # Pieces of up to so many steps are asked for the reason, once the whole trace has told that there is one. Larger ones take minutes to ground.

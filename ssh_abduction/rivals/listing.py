@@ -1,12 +1,12 @@
 """Maps of one trace as they are listed, and what is known of those that are not: of a solution, of a file, or of maps alone.
 
->>> from ssh_abduction.maps import DState, SSHMap
+>>> from ssh_abduction.data.maps import DState, SSHMap
 >>> one = SSHMap((0, 0), (DState(0, "hall"),), ())
 >>> Listing.of([one]).steps
 2
 >>> Listing.of([one, SSHMap((0,), (DState(0, "hall"),), ())])
 Traceback (most recent call last):
-ssh_abduction.errors.MapError: maps[1]: expected 2 steps, as maps[0] has, got 1; compare maps of one trace
+ssh_abduction.data.errors.MapError: maps[1]: expected 2 steps, as maps[0] has, got 1; compare maps of one trace
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
-from ssh_abduction.checks import a_flag, a_text, an_instance
-from ssh_abduction.errors import MapError, brief, is_whole, named
-from ssh_abduction.maps import ID_LENGTH, SSHMap, maps_of, read_json
+from ssh_abduction.data.checks import a_flag, a_text, an_instance
+from ssh_abduction.data.errors import MapError, brief, is_whole, named
+from ssh_abduction.data.maps import ID_LENGTH, SSHMap, maps_of, read_json
+from ssh_abduction.data.trace import View
 from ssh_abduction.solver.recorded import theory_in
 from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import View
 
 
 @dataclass(frozen=True, slots=True)

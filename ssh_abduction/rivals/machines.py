@@ -15,13 +15,13 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.errors import MapError, brief
-from ssh_abduction.maps import SSHMap
-from ssh_abduction.star import Star
+from ssh_abduction.data.errors import MapError, brief
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.star import Star
+from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.steps.log import observation
 from ssh_abduction.theory.evidence.alike import are_alike
 from ssh_abduction.theory.theory import IN_TOLERANCE, Theory
-from ssh_abduction.trace import Trace, View
 
 Array: TypeAlias = NDArray[np.int32]
 Row: TypeAlias = tuple[int, ...]

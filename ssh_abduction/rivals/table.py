@@ -3,7 +3,7 @@
 Steps that are one dstate in all maps are a *class*, and stand in the first step of it. Of each sort (dstates, places, paths, courses) the table has
 for each map and class the first class that is one with it: so the numbers that maps give to their dstates, places and paths play no part.
 
->>> from ssh_abduction.maps import DState, SSHMap
+>>> from ssh_abduction.data.maps import DState, SSHMap
 >>> a, b = DState(0, "hall"), DState(1, "hall")
 >>> table = Table([SSHMap((0, 0, 1), (a, b), ()), SSHMap((0, 1, 1), (a, b), ())])
 >>> table.ones["dstates"].tolist()
@@ -20,8 +20,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.engines.doubts import Sort
-from ssh_abduction.maps import DState, SSHMap
 from ssh_abduction.solver.sharing import SORTS, Backbone, Shared
 
 Ints: TypeAlias = NDArray[np.int32]

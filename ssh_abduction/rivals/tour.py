@@ -40,13 +40,13 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.star import Frame, Star
+from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.rivals.consequences import OF_FRAMES, QUARTERS, is_possible
 from ssh_abduction.rivals.explore import Can
 from ssh_abduction.rivals.machines import Seen, links_of
-from ssh_abduction.star import Frame, Star
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Action, Step, Trace
 
 T = TypeVar("T")
 Copy: TypeAlias = tuple[int, int]  # a place, and 0, or the step of a return to it that is not believed

@@ -22,11 +22,11 @@ from dataclasses import replace
 from itertools import combinations
 
 from ssh_abduction.asp.limits import LimitError, StageTimeError
+from ssh_abduction.data.logs import log_of
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.engines.base import Engine, Task
 from ssh_abduction.engines.doubts import Doubt, Settled
 from ssh_abduction.engines.stepwise import StepEngine, paths_needed
-from ssh_abduction.logs import log_of
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.sharing import Backbone, Sharing
 from ssh_abduction.steps.log import Outcome, Replay

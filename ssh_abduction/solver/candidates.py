@@ -11,12 +11,12 @@ from functools import partial
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import LimitError, Watch
-from ssh_abduction.clock import each_looking, heeding
+from ssh_abduction.data.clock import each_looking, heeding
+from ssh_abduction.data.logs import log_of
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.engines.base import Found, Task
 from ssh_abduction.guesses.gated import gated_map
 from ssh_abduction.guesses.tree import Sketch
-from ssh_abduction.logs import log_of
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.theory.speedups import Speedups, row

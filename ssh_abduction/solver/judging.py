@@ -11,12 +11,12 @@ import time
 from functools import cached_property
 
 from ssh_abduction.asp.own import can_be_asked, keeps_own_rules
-from ssh_abduction.errors import SSHError
+from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.judge.checker import AXIOMS, Violation, check, unchecked, violations
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.theory.evidence import Equality, evidence_of
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 # At most such a share of the time of the search, and so many seconds more, are spent on checking what is not checked always.
 SHARE = 0.1

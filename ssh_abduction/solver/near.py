@@ -14,9 +14,9 @@ from dataclasses import replace
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Asker
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.engines.base import Task
 from ssh_abduction.engines.stepwise import StepEngine
-from ssh_abduction.maps import SSHMap
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known

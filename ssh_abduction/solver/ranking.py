@@ -9,10 +9,10 @@ from itertools import chain, islice
 from typing import TypeAlias
 
 from ssh_abduction.asp.limits import LimitError, Watch
-from ssh_abduction.clock import heeding, look_at_clock
-from ssh_abduction.maps import Fit, SSHMap
+from ssh_abduction.data.clock import heeding, look_at_clock
+from ssh_abduction.data.maps import Fit, SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.displacement import jumped
-from ssh_abduction.trace import Trace
 
 # So many maps are ranked, at most; of a longer list those that come later stay in the order in which they are found, so that memory stays constant.
 RANKED = 1000

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.asp.control import Grounding
+from ssh_abduction.data.errors import MapError, TheoryError
+from ssh_abduction.data.maps import FieldReader
 from ssh_abduction.engines.base import Cost
-from ssh_abduction.errors import MapError, TheoryError
-from ssh_abduction.maps import FieldReader
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.steps.certificate import Certificate
 from ssh_abduction.theory.theory import COUNTS, Theory

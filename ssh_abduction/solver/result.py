@@ -8,14 +8,26 @@ from dataclasses import asdict, dataclass, field
 from enum import Enum
 from typing import Any, overload
 
-from ssh_abduction import cards
 from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import Stop
+from ssh_abduction.data import cards
+from ssh_abduction.data.errors import MapError, brief, checked_index, named
+from ssh_abduction.data.files import json_line
+from ssh_abduction.data.maps import (
+    SOLUTION_FORMAT,
+    VERSION,
+    FieldReader,
+    SSHMap,
+    check_format,
+    check_of_trace,
+    maps_of,
+    read_json,
+    write_map,
+)
+from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.data.words import counted, shortly
 from ssh_abduction.engines.base import Cost, cost_as_counted
-from ssh_abduction.errors import MapError, brief, checked_index, named
-from ssh_abduction.files import json_line
 from ssh_abduction.judge.claims import contradictions
-from ssh_abduction.maps import SOLUTION_FORMAT, VERSION, FieldReader, SSHMap, check_format, check_of_trace, maps_of, read_json, write_map
 from ssh_abduction.solver.backbone import Rivals
 from ssh_abduction.solver.ranking import weights
 from ssh_abduction.solver.recorded import (
@@ -32,8 +44,6 @@ from ssh_abduction.solver.sharing import Backbone, Sharing
 from ssh_abduction.steps.certificate import Basis, Certificate
 from ssh_abduction.steps.noise import LEAST, Noise
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace, checked_trace
-from ssh_abduction.words import counted, shortly
 
 
 class Status(Enum):

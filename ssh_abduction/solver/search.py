@@ -51,13 +51,15 @@ from ssh_abduction.asp import facts
 from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import LimitError, StageTimeError, Stop, Watch, check_limit
 from ssh_abduction.asp.rules import check_rules
-from ssh_abduction.checks import a_flag, an_instance, one_of
-from ssh_abduction.clock import each_heeding, heeding
+from ssh_abduction.data.checks import a_flag, an_instance, one_of
+from ssh_abduction.data.clock import each_heeding, heeding
+from ssh_abduction.data.errors import SolverError, TheoryError, brief, is_whole
+from ssh_abduction.data.logs import PROGRESS, log_of
+from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
+from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.data.words import counted
 from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Found, Task, cost_as_counted
 from ssh_abduction.engines.stepwise import StepEngine
-from ssh_abduction.errors import SolverError, TheoryError, brief, is_whole
-from ssh_abduction.logs import PROGRESS, log_of
-from ssh_abduction.maps import SSHMap, checked_map, checked_maps
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.backbone import Rivals
 from ssh_abduction.solver.candidates import FRAMING_SHARE, Candidates
@@ -72,8 +74,6 @@ from ssh_abduction.steps.certificate import Basis
 from ssh_abduction.theory.evidence import evidence_of, said_by
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
-from ssh_abduction.trace import Trace, checked_trace
-from ssh_abduction.words import counted
 
 FEW_STEPS = 24  # Traces up to this length skip names and greedy maps: solving them directly is faster.
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.

@@ -1,6 +1,6 @@
 """What maps of one trace share: which steps are one dstate, at one place, along one path and course, in all, in some, or in none of them.
 
->>> from ssh_abduction.maps import DState, SSHMap
+>>> from ssh_abduction.data.maps import DState, SSHMap
 >>> a, b = DState(0, "hall"), DState(1, "hall")
 >>> shared = Sharing()
 >>> shared.absorb(SSHMap((0, 0, 1), (a, b), ()))
@@ -19,11 +19,11 @@ from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, Literal, TypeAlias
 
-from ssh_abduction.checks import a_text, a_whole_number
+from ssh_abduction.data.checks import a_text, a_whole_number
+from ssh_abduction.data.errors import MapError, brief, is_whole
+from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.data.words import counted
 from ssh_abduction.engines.doubts import Sort
-from ssh_abduction.errors import MapError, brief, is_whole
-from ssh_abduction.maps import DState, SSHMap
-from ssh_abduction.words import counted
 
 Pair: TypeAlias = tuple[int, int]
 

@@ -17,10 +17,10 @@ from functools import cached_property
 from itertools import combinations
 from typing import Any
 
-from ssh_abduction.errors import SolverError
+from ssh_abduction.data.errors import SolverError
+from ssh_abduction.data.trace import Trace, View, checked_trace
+from ssh_abduction.data.words import counted
 from ssh_abduction.steps.noise import Noise, noise_in
-from ssh_abduction.trace import Trace, View, checked_trace
-from ssh_abduction.words import counted
 
 RESTS_ON = frozenset({"functional_view", "deterministic"})  # the axioms that make apart steps different dstates
 # A certificate in a file has its words only if they have at most this many actions in all, some megabytes. Where steps look alike for long, words grow with

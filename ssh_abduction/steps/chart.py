@@ -22,9 +22,9 @@ from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
+from ssh_abduction.data.trace import Trace, TurnDirection
 from ssh_abduction.steps.log import Log
 from ssh_abduction.theory.pairs import Earlier
-from ssh_abduction.trace import Trace, TurnDirection
 
 if TYPE_CHECKING:
     import numpy as np

@@ -4,7 +4,7 @@ A step sees one of few *frames*: its star, where each gateway that was not obser
 an earlier one, for some *shift* C. That fixes by how much the robot has turned, up to the spreads of the bearings: a set of rotations, in whole degrees. No rotation at all means that the
 two frames are not one place's, shifted so.
 
->>> from ssh_abduction.star import Star
+>>> from ssh_abduction.data.star import Star
 >>> from ssh_abduction.steps.frames import members, rotations
 >>> junction, turned = Star.of((0, 120, 240)).frames[0], Star.of((60, 180, 300)).frames[0]
 >>> [min(members(rotations(junction, turned, shift)), default=None) for shift in range(3)]
@@ -18,8 +18,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 
-from ssh_abduction.star import SPREAD, Frame, Star
-from ssh_abduction.trace import Action, Trace
+from ssh_abduction.data.star import SPREAD, Frame, Star
+from ssh_abduction.data.trace import Action, Trace
 
 # A set of rotations is a number: its bit R says whether R degrees clockwise are in the set.
 FULL = (1 << 360) - 1

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Step, Trace
 
 # Where the greedy map does not know an action, at most this many dstates of the view that is seen are tried as its end, those found first: so a view that is seen
 # nearly everywhere does not use up all predictions at once.

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.trace import Trace
 
 # No step looks like noise among the first so many steps, nor in a trace that is no longer: a robot that has just begun may well be somewhere new at each step.
 LEAST = 20

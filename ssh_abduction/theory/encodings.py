@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from ssh_abduction.files import shipped
+from ssh_abduction.data.files import shipped
 
 FIRST = (
     "causal",

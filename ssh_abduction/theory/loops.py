@@ -34,8 +34,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssh_abduction.odometry import ROUNDED, Odometry
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.odometry import ROUNDED, Odometry
+from ssh_abduction.data.trace import Trace
 
 Array: TypeAlias = NDArray[np.float64]
 Steps: TypeAlias = NDArray[np.int_]

@@ -14,8 +14,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ssh_abduction.errors import TheoryError, brief, is_writable
-from ssh_abduction.files import read_at_most
+from ssh_abduction.data.errors import TheoryError, brief, is_writable
+from ssh_abduction.data.files import read_at_most
 from ssh_abduction.theory.encodings import Axiom, axioms_in
 
 # Bytes that a file of rules may have: a device that never ends is refused before it fills the memory.

@@ -18,10 +18,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Final
 
-from ssh_abduction.errors import SolverError, brief
+from ssh_abduction.data.errors import SolverError, brief
+from ssh_abduction.data.words import shortly
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import EXCUSED, Theory, checked_theory
-from ssh_abduction.words import shortly
 
 
 @dataclass(frozen=True, slots=True)

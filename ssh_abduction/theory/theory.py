@@ -15,13 +15,13 @@ from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
-from ssh_abduction.checks import a_text, a_whole_number, an_instance, one_of
-from ssh_abduction.errors import TheoryError, TraceError, brief, is_finite, is_whole
+from ssh_abduction.data.checks import a_text, a_whole_number, an_instance, one_of
+from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_finite, is_whole
+from ssh_abduction.data.trace import Step, Trace, checked_trace
+from ssh_abduction.data.words import shortly
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.rules import Rules
-from ssh_abduction.trace import Step, Trace, checked_trace
-from ssh_abduction.words import shortly
 
 Count: TypeAlias = Literal["dstates", "paths", "places", "excuses", "auto", "tenths"]
 Pair: TypeAlias = tuple[int, int]  # of steps

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from ssh_abduction.asp.limits import Watch
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.rivals.explain import PairExplanation, explain_pair
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.trace import Trace
 
 
 def explained(trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch) -> PairExplanation:

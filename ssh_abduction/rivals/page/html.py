@@ -12,12 +12,12 @@ from functools import cache
 from pathlib import Path as FilePath
 from typing import Any
 
-from ssh_abduction.checks import a_function
-from ssh_abduction.errors import MapError
-from ssh_abduction.maps import SSHMap, write_map
+from ssh_abduction.data.checks import a_function
+from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.maps import SSHMap, write_map
+from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.rivals.listing import Maps
 from ssh_abduction.rivals.page.content import Run, content_of
-from ssh_abduction.trace import Trace, checked_trace
 
 HERE = FilePath(__file__).parent
 ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}

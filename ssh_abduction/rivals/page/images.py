@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from perception.errors import PerceptionError
 from perception.images import images_held
-from ssh_abduction.errors import TraceError, brief, is_finite, named
-from ssh_abduction.trace import Trace
+from ssh_abduction.data.errors import TraceError, brief, is_finite, named
+from ssh_abduction.data.trace import Trace
 
 ALPHABET = "".join(chr(c) for c in range(35, 127) if chr(c) not in "&<>\\")
 LOST = "!"  # a beam that measured nothing

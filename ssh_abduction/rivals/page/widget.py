@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ssh_abduction.errors import MapError
+from ssh_abduction.data.errors import MapError
 
 SHOW = """
 export default { render({ model, el }) {

@@ -15,13 +15,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.alike import Alike
 from ssh_abduction.theory.evidence.asserted import Asserted
 from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.planar import Planar
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
-from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory

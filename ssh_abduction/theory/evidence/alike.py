@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, ClassVar
 
-from ssh_abduction.maps import SSHMap
-from ssh_abduction.star import Star
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.star import Star
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.pairs import Pairs
-from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory

@@ -27,11 +27,11 @@ from functools import cached_property
 from operator import is_
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
-from ssh_abduction.clock import look_at_clock
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.data.clock import look_at_clock
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
-from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
     from ssh_abduction.theory.loops import Reckoning, Steps

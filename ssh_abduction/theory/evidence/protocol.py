@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
-from ssh_abduction.maps import SSHMap
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.pairs import Pairs
-from ssh_abduction.trace import Trace
 
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory

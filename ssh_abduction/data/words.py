@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import MISSING, fields
 from typing import Any
 
-from ssh_abduction.errors import brief
+from ssh_abduction.data.errors import brief
 
 
 def counted(number: float, things: str) -> str:

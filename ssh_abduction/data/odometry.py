@@ -1,6 +1,6 @@
 """What a robot's odometry is worth: how far the displacements that it reports may be off.
 
->>> from ssh_abduction.odometry import Odometry
+>>> from ssh_abduction.data.odometry import Odometry
 >>> covariance = Odometry(along=0.05, across=0.0, position=0.0).covariance((10.0, 0.0, 0.0))
 >>> round(covariance[0][0], 3), round(covariance[1][1], 3)
 (0.25, 0.0)
@@ -15,8 +15,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, TypeAlias
 
-from ssh_abduction.checks import an_object
-from ssh_abduction.errors import TraceError, brief, is_finite
+from ssh_abduction.data.checks import an_object
+from ssh_abduction.data.errors import TraceError, brief, is_finite
 
 Pose: TypeAlias = tuple[float, float, float]
 Displacement: TypeAlias = tuple[float, float, float]

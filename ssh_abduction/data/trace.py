@@ -20,13 +20,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias, overload
 
-from ssh_abduction import cards
-from ssh_abduction.checks import a_list, a_path, a_text, a_whole_number, an_instance, an_object
-from ssh_abduction.errors import RangeError, TraceError, brief, checked_index, is_finite, is_whole, is_writable, named
-from ssh_abduction.files import LINE_OF_A_LOG, HalfCharacter, NotFinite, json_line, parse_json, write_file
-from ssh_abduction.odometry import Covariance, Displacement, Odometry, checked_covariance, checked_displacement
-from ssh_abduction.star import SPREAD, Entry, Gateway, Openings, Star, is_four, near_quarter, parse_star
-from ssh_abduction.words import counted, that_differ
+from ssh_abduction.data import cards
+from ssh_abduction.data.checks import a_list, a_path, a_text, a_whole_number, an_instance, an_object
+from ssh_abduction.data.errors import RangeError, TraceError, brief, checked_index, is_finite, is_whole, is_writable, named
+from ssh_abduction.data.files import LINE_OF_A_LOG, HalfCharacter, NotFinite, json_line, parse_json, write_file
+from ssh_abduction.data.odometry import Covariance, Displacement, Odometry, checked_covariance, checked_displacement
+from ssh_abduction.data.star import SPREAD, Entry, Gateway, Openings, Star, is_four, near_quarter, parse_star
+from ssh_abduction.data.words import counted, that_differ
 
 View: TypeAlias = str | int
 Kind: TypeAlias = Literal["travel", "turn"]

@@ -76,7 +76,7 @@ def json_line(value: Any) -> str:
 @cache
 def shipped(name: str) -> Path:
     """The folder of this name that ships: inside the installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parent.parent
     packaged = package / name
     return packaged if packaged.is_dir() else package.parent / name
 

@@ -1,6 +1,6 @@
 """Stars: which gateways a robot sees at a place, and in which direction each of them is.
 
->>> from ssh_abduction.star import Star
+>>> from ssh_abduction.data.star import Star
 >>> [gateway.bearing for gateway in Star.of((1, 0, 1, 0)).gateways]
 [0.0, 180.0]
 >>> Star.of((0, 120, 240)).openings is None
@@ -20,7 +20,7 @@ from itertools import combinations
 from math import ceil
 from typing import Any, TypeAlias
 
-from ssh_abduction.errors import TraceError, brief, is_finite, is_whole
+from ssh_abduction.data.errors import TraceError, brief, is_finite, is_whole
 
 Openings: TypeAlias = tuple[bool, bool, bool, bool]
 Entry: TypeAlias = "float | Gateway | None"

@@ -12,7 +12,7 @@ SIGNALLED, CTRL_C = 128, 2
 heard: list[int] = []  # the signals that asked this process to end, in their order
 raised: list[int] = []  # those of them that became a KeyboardInterrupt
 
-_PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+_PACKAGE = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
 # What a new process runs first, as `python -P -c`. The option -P keeps the current folder off the path; the path of the process that began it comes next.
 _START = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from {} import serve; serve()"

@@ -19,12 +19,12 @@ from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
-from ssh_abduction import cards
-from ssh_abduction.checks import a_path, a_text, all_instances, an_instance
-from ssh_abduction.errors import MapError, brief, is_finite, is_whole, is_writable, named, printable, xml_text
-from ssh_abduction.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
-from ssh_abduction.trace import Trace, View
-from ssh_abduction.words import counted
+from ssh_abduction.data import cards
+from ssh_abduction.data.checks import a_path, a_text, all_instances, an_instance
+from ssh_abduction.data.errors import MapError, brief, is_finite, is_whole, is_writable, named, printable, xml_text
+from ssh_abduction.data.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
+from ssh_abduction.data.trace import Trace, View
+from ssh_abduction.data.words import counted
 
 if TYPE_CHECKING:
     import networkx as nx

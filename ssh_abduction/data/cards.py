@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from ssh_abduction.errors import printable
+from ssh_abduction.data.errors import printable
 
 ROWS = 50  # So many rows of a table are shown, at most: more make a notebook slow, and nobody reads them there.
 LONGEST = 80  # characters of a cell

@@ -1,15 +1,15 @@
 """One way to check the arguments of public functions: each check returns the value, or raises one of the package's errors.
 
->>> from ssh_abduction.checks import a_number, one_of
->>> from ssh_abduction.errors import MapError, SolverError
+>>> from ssh_abduction.data.checks import a_number, one_of
+>>> from ssh_abduction.data.errors import MapError, SolverError
 >>> a_number("near", 2, SolverError, above=0, what="metres")
 2.0
 >>> a_number("near", -1, SolverError, above=0, what="metres")
 Traceback (most recent call last):
-ssh_abduction.errors.SolverError: near: expected metres above 0, got -1; change it
+ssh_abduction.data.errors.SolverError: near: expected metres above 0, got -1; change it
 >>> one_of("level", "rooms", ("places", "dstates"), MapError)
 Traceback (most recent call last):
-ssh_abduction.errors.MapError: level: expected places or dstates, got 'rooms'; take one of these
+ssh_abduction.data.errors.MapError: level: expected places or dstates, got 'rooms'; take one of these
 
 All checks take the name of the argument, its value, and the error to raise. numpy's numbers are numbers; true and false are
 none. A path is a text or an os.PathLike that stands for a text. Bytes are no path: decode them with os.fsdecode.
@@ -22,7 +22,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias, TypeVar
 
-from ssh_abduction.errors import SSHError, brief, is_finite, is_whole
+from ssh_abduction.data.errors import SSHError, brief, is_finite, is_whole
 
 T = TypeVar("T")
 Kind: TypeAlias = type[SSHError]
