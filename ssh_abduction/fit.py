@@ -33,7 +33,7 @@ from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.data.maps import Fit, Pose, SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.loops import turned
+from ssh_abduction.theory.evidence.loops import turned
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from ssh_abduction.judge.checker import check
 from ssh_abduction.solver.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns
-from ssh_abduction.theory.loops import Loops
+from ssh_abduction.theory.evidence.loops import Loops
 
 ROOM = 10.0  # metres from corner to corner
 WHITE = Odometry(scale=0.0, bend=0.0)

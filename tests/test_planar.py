@@ -22,8 +22,8 @@ from ssh_abduction.data.maps import DState
 from ssh_abduction.judge import check
 from ssh_abduction.judge.planarity import Edges
 from ssh_abduction.solver import prefixes, search
-from ssh_abduction.theory.drawing import can_be_drawn, is_planar
 from ssh_abduction.theory.evidence import Equality, Planar
+from ssh_abduction.theory.planarity import can_be_drawn, is_planar
 
 # Drawings, against networkx
 

@@ -17,8 +17,8 @@ from ssh_abduction.judge import geometry
 from ssh_abduction.judge.geometry import refused_returns
 from ssh_abduction.theory.evidence import displacement as module
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns
-from ssh_abduction.theory.loops import Loops, Reckoning, chi_squares
-from ssh_abduction.theory.together import Together, joint_squares
+from ssh_abduction.theory.evidence.loops import Loops, Reckoning, chi_squares
+from ssh_abduction.theory.evidence.together import Together, joint_squares
 
 
 def seen(trace: Trace, truth: tuple[object, ...], dstates: int = 1000) -> SSHMap:

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.loops import Loops, Reckoning, chi_squares
+from ssh_abduction.theory.evidence.loops import Loops, Reckoning, chi_squares
 
 # A displacement that is wrong takes the robot so many metres away, about, as the standard deviation in each direction; and it turns it anyhow, for which that many radians stand.
 FAR, ANYHOW = 15.0, math.pi / math.sqrt(3)

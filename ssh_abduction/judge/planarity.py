@@ -21,7 +21,7 @@ from typing import TypeAlias
 
 from ssh_abduction.data.clock import each_looking, look_at_clock
 from ssh_abduction.data.star import Openings
-from ssh_abduction.theory.drawing import can_be_drawn
+from ssh_abduction.theory.planarity import can_be_drawn
 
 Arm: TypeAlias = tuple[int, int]  # of a dstate, ahead (1) or behind (-1)
 Option: TypeAlias = Mapping[Arm, int]  # the position of each arm around its place, clockwise; those of one gateway have one

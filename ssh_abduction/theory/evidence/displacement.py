@@ -34,9 +34,9 @@ from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
 
 if TYPE_CHECKING:
-    from ssh_abduction.theory.loops import Reckoning, Steps
+    from ssh_abduction.theory.evidence.loops import Reckoning, Steps
+    from ssh_abduction.theory.evidence.together import Mask, Together
     from ssh_abduction.theory.theory import Theory
-    from ssh_abduction.theory.together import Mask, Together
 
 # The first steps and the last ones of returns, of places (True) and of dstates (False).
 _Tested: TypeAlias = "dict[bool, tuple[Steps, Steps]]"
@@ -136,7 +136,7 @@ class Returns:
         before     the returns of the first steps, if these are known
         reckoning  that of the trace, if it is known
         """
-        from ssh_abduction.theory.loops import Reckoning  # loads numpy
+        from ssh_abduction.theory.evidence.loops import Reckoning  # loads numpy
 
         self.evidence, self.trace = evidence, trace
         self.reckoning: Reckoning = reckoning or Reckoning(trace, before.reckoning if before else None)
@@ -208,7 +208,7 @@ class Returns:
         """How many of these returns have a p-value above one half."""
         from scipy.special import gammainccinv
 
-        from ssh_abduction.theory.loops import chi_squares
+        from ssh_abduction.theory.evidence.loops import chi_squares
 
         loops, likely = self.reckoning.loops_of_unknown_drift(), 0
         for places, (first, last) in tested.items():
@@ -234,7 +234,7 @@ class Returns:
         """Which of these returns are refused alone: those that close badly whatever drift the heading has."""
         import numpy as np
 
-        from ssh_abduction.theory.loops import chi_squares
+        from ssh_abduction.theory.evidence.loops import chi_squares
 
         most, which = self.threshold(2 if places else 3, together=False), 0 if places else 1
         drifts = [number for number, unlikely in enumerate(self.reckoning.unlikely) if unlikely <= most]
@@ -342,7 +342,7 @@ class Returns:
         """How clearly a return is refused alone: its chi-square, less the threshold."""
         import numpy as np
 
-        from ssh_abduction.theory.loops import chi_squares
+        from ssh_abduction.theory.evidence.loops import chi_squares
 
         first, last, which = refused.first, refused.second, int(refused.of == "dstate")
         squares = chi_squares(*self.reckoning.loops_of_unknown_drift().closings(np.array([first]), np.array([last])))
@@ -382,7 +382,7 @@ class Returns:
         """How far off the loop from one step to another closes, by dead reckoning; what repeats in all displacements counts as uncertainty."""
         import numpy as np
 
-        from ssh_abduction.theory.loops import chi_squares
+        from ssh_abduction.theory.evidence.loops import chi_squares
 
         loops = self.reckoning.loops_of_unknown_drift()
         off, covariance = loops.closings([first], [last])
@@ -402,7 +402,7 @@ class Returns:
         return self.arrivals[bisect(self.arrivals, step) - 1] if self.evidence.turns_stay else step
 
     def _together(self, rows: Steps, before: Together | None = None) -> Together:
-        from ssh_abduction.theory.together import Together  # loads numpy
+        from ssh_abduction.theory.evidence.together import Together  # loads numpy
 
         thresholds = {freedom: self.threshold(freedom, together=True) for freedom in (4, 5, 6)}
         return Together(self.reckoning, thresholds, rows, before)

@@ -1,7 +1,7 @@
 """How far off the loops of a trace close: displacements and their covariances, composed along the trace.
 
 >>> from ssh_abduction import Trace
->>> from ssh_abduction.theory.loops import Loops
+>>> from ssh_abduction.theory.evidence.loops import Loops
 >>> square = [(10, 0, 0), (0, 0, 1.5708)] * 4
 >>> loops = Loops.of(Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=square))
 >>> closing, covariance = loops.closings([0], [8])
