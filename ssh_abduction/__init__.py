@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from ssh_abduction.engines.base import Cost
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, VisitsEvaluation, evaluate, evaluate_visits
     from ssh_abduction.explorer import Exploration, Explorer
-    from ssh_abduction.export.formats import export_map
     from ssh_abduction.localize import Belief, Chances, Localiser
     from ssh_abduction.online.mapper import OnlineMapper
+    from ssh_abduction.output.export.formats import export_map
     from ssh_abduction.rivals.compare import Comparison, compare
     from ssh_abduction.rivals.difference import Difference, difference
     from ssh_abduction.rivals.explore import Experiment, next_experiment
@@ -39,7 +39,7 @@ _HOMES = {  # module: the names that it exports
     "engines.base": ("Cost",),
     "data.errors": ("LocaliserError", "MapError", "RangeError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "VisitsEvaluation", "evaluate", "evaluate_visits"),
-    "export.formats": ("export_map",),
+    "output.export.formats": ("export_map",),
     "explorer": ("Exploration", "Explorer"),
     "localize": ("Belief", "Chances", "Localiser"),
     "data.maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),

@@ -28,7 +28,7 @@ from ssh_abduction.data.errors import MapError, brief, is_whole, printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import View
 from ssh_abduction.data.words import counted
-from ssh_abduction.layout import located
+from ssh_abduction.output.layout import located
 from ssh_abduction.rivals.listing import Listing, Maps
 
 if TYPE_CHECKING:

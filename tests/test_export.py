@@ -17,9 +17,9 @@ from ssh_abduction import MapError, SSHMap, Theory, Trace, export_map, solve
 from ssh_abduction.cli import export as verb
 from ssh_abduction.cli import main
 from ssh_abduction.data.maps import DState
-from ssh_abduction.export import formats
-from ssh_abduction.export.roads import TURN, Road, Roads, Stop
-from ssh_abduction.export.tmap2 import tmap2
+from ssh_abduction.output.export import formats
+from ssh_abduction.output.export.roads import TURN, Road, Roads, Stop
+from ssh_abduction.output.export.tmap2 import tmap2
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from worlds import COMB, HEADINGS, PLUS, SQUARE, TEE, TOURS, TWO_BLOCKS, Streets
 
 from ssh_abduction import DState, MapError, Path, SSHMap, Theory, Trace, solve
 from ssh_abduction.data.maps import Fault, Fit, Pose
-from ssh_abduction.layout import Layout, layout
+from ssh_abduction.output.layout import Layout, layout
 
 SIX = streets(
     *((f"{x}{y}", "E", f"{x + 1}{y}") for x in range(5) for y in range(6)),

@@ -11,7 +11,7 @@ import pytest
 from worlds import SQUARE, TEE, TOURS, Streets, drive, rectangle, streets, written
 
 from ssh_abduction import MapError, SSHMap, Theory, solve
-from ssh_abduction.picture import svg
+from ssh_abduction.output.picture import svg
 
 SVG = "{http://www.w3.org/2000/svg}"
 

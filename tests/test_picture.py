@@ -18,7 +18,7 @@ from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data.maps import DState, Fit, Pose
 from ssh_abduction.data.maps import Path as Street
-from ssh_abduction.picture import svg
+from ssh_abduction.output.picture import svg
 
 SVG = "{http://www.w3.org/2000/svg}"
 SQUARE = [(10.0, 0.3, 0.02), (0.0, 0.0, math.pi / 2)] * 4

@@ -9,7 +9,7 @@ from ssh_abduction.cli.options import Verbs
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.trace import Trace
 
-# As ssh_abduction.export has them, which loads networkx, which would delay each verb.
+# As ssh_abduction.output.export has them, which loads networkx, which would delay each verb.
 FORMATS = ("nav2", "tmap2", "graphml", "dot", "networkx-json")
 
 
@@ -36,7 +36,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.data.maps import write_map
-    from ssh_abduction.export.formats import doubts, export_map  # which loads networkx
+    from ssh_abduction.output.export.formats import doubts, export_map  # which loads networkx
     from ssh_abduction.rivals.listing import Listing
 
     listing = Listing.load(options.maps)

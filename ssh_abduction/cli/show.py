@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     elif options.graphml:
         print(chosen.to_graphml())
     elif options.svg:
-        from ssh_abduction.picture import svg
+        from ssh_abduction.output.picture import svg
 
         picture = svg(chosen)
         if options.svg == "-":

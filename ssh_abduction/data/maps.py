@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import networkx as nx
     import pandas as pd
 
-    from ssh_abduction.layout import Turns
+    from ssh_abduction.output.layout import Turns
 
 # What files of solutions and of single maps begin with.
 SOLUTION_FORMAT, MAP_FORMAT, VERSION = "ssh-solution", "ssh-map", 1
@@ -183,7 +183,7 @@ class SSHMap:
 
     def _repr_html_(self) -> str:
         """What notebooks show: the picture, how well the map closes, what it disbelieves, and its dstates."""
-        from ssh_abduction.picture import svg
+        from ssh_abduction.output.picture import svg
 
         parts = [
             cards.picture(svg(self)) if len(self.dstates) <= DRAWN else cards.paragraph(f"not drawn, as it has more than {DRAWN} dstates")
@@ -328,16 +328,16 @@ class SSHMap:
 
         turns  which way actions turn: the trace that was mapped, or for each name "right", "left", "around" or degrees clockwise. Actions of these names need none
         """
-        from ssh_abduction.layout import degrees_of
-        from ssh_abduction.picture import svg
+        from ssh_abduction.output.layout import degrees_of
+        from ssh_abduction.output.picture import svg
 
         degrees_of(turns)
         return svg(self, turns)
 
     def plot(self, ax: Any = None, turns: Trace | Turns | None = None) -> Any:
         """Draw the map with matplotlib, into these axes or into new ones, and return the axes. Raises MapError where matplotlib is not installed."""
-        from ssh_abduction.layout import degrees_of
-        from ssh_abduction.plotting import plot
+        from ssh_abduction.output.layout import degrees_of
+        from ssh_abduction.output.plotting import plot
 
         degrees_of(turns)
         return plot(self, ax, turns)
@@ -384,7 +384,7 @@ class SSHMap:
         import networkx as nx
 
         if turns is not None:
-            from ssh_abduction.layout import degrees_of  # loads scipy
+            from ssh_abduction.output.layout import degrees_of  # loads scipy
 
             degrees_of(turns)
         if not isinstance(level, str):
@@ -412,7 +412,7 @@ class SSHMap:
     def _graph_of_places(self, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
         import networkx as nx
 
-        from ssh_abduction.layout import layout, travelled
+        from ssh_abduction.output.layout import layout, travelled
 
         found = layout(self, turns)
         graph: nx.MultiGraph[Any] = nx.MultiGraph(metric=found.metric)

@@ -18,8 +18,8 @@ from typing import Any, TypeAlias
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.trace import Step, Trace
-from ssh_abduction.layout import Layout, layout
-from ssh_abduction.metric_picture import axes
+from ssh_abduction.output.layout import Layout, layout
+from ssh_abduction.output.metric_picture import axes
 from ssh_abduction.rivals.compare import compare
 from ssh_abduction.rivals.listing import Listing, Maps
 from ssh_abduction.rivals.page.images import drawn_images

@@ -13,8 +13,8 @@ from itertools import pairwise
 from statistics import median
 from typing import TYPE_CHECKING
 
-from ssh_abduction.drawing import COLOURS, Point, escaped, fault_mark, page, text
-from ssh_abduction.layout import travelled
+from ssh_abduction.output.drawing import COLOURS, Point, escaped, fault_mark, page, text
+from ssh_abduction.output.layout import travelled
 
 if TYPE_CHECKING:
     from ssh_abduction.data.maps import DState, Pose, SSHMap

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ssh_abduction.export.roads import Road, Roads, Stop
+from ssh_abduction.output.export.roads import Road, Roads, Stop
 
 ACTION = "NavigateToPose"
 DIGITS = 4  # of coordinates, in metres

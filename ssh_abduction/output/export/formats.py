@@ -17,10 +17,10 @@ from ssh_abduction.data.errors import MapError, brief, is_writable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.export.nav2 import nav2
-from ssh_abduction.export.roads import Roads
-from ssh_abduction.export.tmap2 import tmap2
-from ssh_abduction.layout import Turns, degrees_of
+from ssh_abduction.output.export.nav2 import nav2
+from ssh_abduction.output.export.roads import Roads
+from ssh_abduction.output.export.tmap2 import tmap2
+from ssh_abduction.output.layout import Turns, degrees_of
 
 FORMATS = ("nav2", "tmap2", "graphml", "dot", "networkx-json")
 FOR_NAVIGATION = ("nav2", "tmap2")  # which need positions

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from ssh_abduction.data.files import json_line
-from ssh_abduction.export.roads import Road, Roads, Stop
+from ssh_abduction.output.export.roads import Road, Roads, Stop
 
 DIGITS = 4  # of coordinates, in metres
 

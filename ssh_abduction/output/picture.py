@@ -11,9 +11,9 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.drawing import COLOURS, RADIUS, Point, escaped, fault_mark, page, text
-from ssh_abduction.layout import Layout, Turns, layout, located, travelled
-from ssh_abduction.metric_picture import metric_svg
+from ssh_abduction.output.drawing import COLOURS, RADIUS, Point, escaped, fault_mark, page, text
+from ssh_abduction.output.layout import Layout, Turns, layout, located, travelled
+from ssh_abduction.output.metric_picture import metric_svg
 
 if TYPE_CHECKING:
     from ssh_abduction.data.maps import DState, SSHMap

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.drawing import ALARM, COLOURS
-from ssh_abduction.layout import Turns, layout, travelled
+from ssh_abduction.output.drawing import ALARM, COLOURS
+from ssh_abduction.output.layout import Turns, layout, travelled
 
 if TYPE_CHECKING:
     from ssh_abduction.data.maps import SSHMap
