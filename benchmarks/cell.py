@@ -32,7 +32,7 @@ from table import OURS, WITHOUT
 from ssh_abduction import Search, Solution, Speedups, Theory, Trace
 from ssh_abduction.asp import limits
 from ssh_abduction.asp.limits import peak_memory
-from ssh_abduction.judge.checker import check
+from ssh_abduction.checker.checker import check
 from ssh_abduction.solver.result import Status
 
 AROUND = 300  # seconds for all that the clock does not count

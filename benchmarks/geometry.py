@@ -18,8 +18,8 @@ from unittest.mock import patch
 from instances import maze
 from truth import NOISE
 
+import ssh_abduction.checker.geometry
 import ssh_abduction.fit
-import ssh_abduction.judge.geometry
 from ssh_abduction import Odometry, Theory, Trace, solve
 from ssh_abduction.solver.result import Status
 from ssh_abduction.theory.evidence import displacement
@@ -29,7 +29,7 @@ BEGINS = (
     (displacement.Displacement, "pairs"),
     (displacement.Displacement, "refuse"),
     (displacement, "count_returns"),
-    (ssh_abduction.judge.geometry, "refused_returns"),
+    (ssh_abduction.checker.geometry, "refused_returns"),
     (ssh_abduction.fit, "fit"),
 )
 

@@ -16,7 +16,7 @@ import numpy as np
 from instances import Walk, maze
 
 from ssh_abduction import DState, Odometry, SSHMap, Theory
-from ssh_abduction.judge.geometry import refused_returns
+from ssh_abduction.checker.geometry import refused_returns
 
 REJECTS = (0.5, 0.2, 0.05, 0.01, 0.001)
 MODEL = Odometry()

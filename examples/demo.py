@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 
 from ssh_abduction import Theory, Trace, compare, solve
+from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main as main_of_the_shell
 from ssh_abduction.cli.text import compared, describe
-from ssh_abduction.judge.checker import check
 from ssh_abduction.output.picture import svg
 
 

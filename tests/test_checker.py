@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssh_abduction.checker.checker import AXIOMS, COHERENCE, Violation, check
 from ssh_abduction.data.maps import DState, Path, SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.judge.checker import AXIOMS, COHERENCE, Violation, check
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import Theory
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from ssh_abduction import Status, Theory, Trace, solve
-from ssh_abduction.judge.checker import check
+from ssh_abduction.checker.checker import check
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

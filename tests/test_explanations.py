@@ -14,9 +14,9 @@ from brute_geometry import Geometry
 from test_displacement import WHITE, circuit
 
 from ssh_abduction import Odometry, Status, Theory, Trace, TraceError, solve
+from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.explain import explain, why_apart
-from ssh_abduction.judge.checker import check
 from ssh_abduction.theory.evidence import evidence_of, pairs_of
 from ssh_abduction.theory.pairs import pairs_in
 

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from instances import faulty_machine
 
 from ssh_abduction import Speedups, Status, Step, Theory, Trace, solve
+from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import Fault, SSHMap
@@ -27,7 +28,6 @@ from ssh_abduction.engines.base import Task
 from ssh_abduction.engines.blocks import Blocks
 from ssh_abduction.front import fault_front
 from ssh_abduction.guesses.robust import Explainer
-from ssh_abduction.judge.checker import check
 from ssh_abduction.solver import search
 
 Told = tuple[tuple[int, ...], frozenset[tuple[int, str, object]]]  # the labels of the steps, and the faults

@@ -18,6 +18,8 @@ from strategies import STARS
 from ssh_abduction import OnlineMapper, Search, Speedups, Status, Theory, Trace, solve
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import LimitError, Watch
+from ssh_abduction.checker.checker import check
+from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.engines import base as engine
 from ssh_abduction.engines import framed
@@ -31,8 +33,6 @@ from ssh_abduction.engines.visits import OPEN, VisitLabels
 from ssh_abduction.guesses import annealing
 from ssh_abduction.guesses.annealing import Guess, attempts
 from ssh_abduction.guesses.merging import kept, merged_near
-from ssh_abduction.judge.checker import check
-from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.steps.chart import QUARTERS, Chart, FramedChart, numbered

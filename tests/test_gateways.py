@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from planar import drive
 
 from ssh_abduction import OnlineMapper, Status, Theory, Trace, TraceError, solve
+from ssh_abduction.checker import gateways as judge
+from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data.maps import maps_of, read_json
 from ssh_abduction.data.star import Frame, Gateway, Star
 from ssh_abduction.data.trace import Action, Step
-from ssh_abduction.judge import gateways as judge
-from ssh_abduction.judge.checker import check
 from ssh_abduction.solver import prefixes
 from ssh_abduction.steps import frames
 from ssh_abduction.theory.speedups import Speedups

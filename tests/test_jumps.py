@@ -18,9 +18,9 @@ from perception.places.track import Track
 from perception.readers.scans import Pose, RobotLog, Scan
 from simulator.tours import record
 from simulator.world import World
+from ssh_abduction.checker.checker import check
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.odometry import between, moved
-from ssh_abduction.judge.checker import check
 from ssh_abduction.solver.search import solve
 
 START: Pose = (0.0, 0.0, 0.0)

@@ -32,9 +32,9 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Step, Theory, Trace, solve
 from ssh_abduction import learner as learner_module
+from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import TraceError
-from ssh_abduction.judge.checker import check
 from ssh_abduction.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning, labels_of
 from ssh_abduction.reproduce.claims import EXPERIMENTS, Run, claims, measure, one_to_one, outcome, rate, summary, true_dstates
 from ssh_abduction.runner_up import runner_up, second_map, with_runner_up

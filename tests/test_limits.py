@@ -21,8 +21,8 @@ from ssh_abduction import Search, Status, Theory, Trace, solve
 from ssh_abduction.asp import workers
 from ssh_abduction.asp.control import Control
 from ssh_abduction.asp.limits import LimitError, Watch, peak_memory
+from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.explain import Axioms, Interrupted, Piece
-from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.steps import certificate
 from ssh_abduction.steps.noise import noise_in

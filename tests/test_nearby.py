@@ -18,6 +18,7 @@ from test_speedups import PLAIN, machines
 from ssh_abduction import Speedups, Status, Theory, Trace, solve
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import LimitError, Watch
+from ssh_abduction.checker.checker import check
 from ssh_abduction.engines import base as engine
 from ssh_abduction.engines import naming as named
 from ssh_abduction.engines import nearby
@@ -26,7 +27,6 @@ from ssh_abduction.engines.causal import CausalEngine
 from ssh_abduction.engines.nearby import Beside, NearbySearch
 from ssh_abduction.guesses import annealing
 from ssh_abduction.guesses.annealing import annealed
-from ssh_abduction.judge.checker import check
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.steps.chart import Chart

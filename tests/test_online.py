@@ -21,10 +21,10 @@ from strategies import FOREIGN, PAIRS, theories, traces
 from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Action, Odometry, OnlineMapper, Solution, SSHMap, Status, Step, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction.checker.checker import check
 from ssh_abduction.engines.base import Task
 from ssh_abduction.guesses import annealing
 from ssh_abduction.guesses.tree import Sketch
-from ssh_abduction.judge.checker import check
 from ssh_abduction.online import background as guessing
 from ssh_abduction.online import mapper as online
 from ssh_abduction.steps.chart import Chart

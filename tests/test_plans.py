@@ -13,10 +13,10 @@ from simulator.errors import SimulatorError
 from simulator.motion import moved
 from simulator.plans import APART, STRAIGHT, Plan, tour
 from ssh_abduction import Odometry, Theory, Trace, evaluate, solve
+from ssh_abduction.checker.checker import check, turned
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.maps import Path as Course
 from ssh_abduction.data.trace import Step
-from ssh_abduction.judge.checker import check, turned
 
 PLANS = Path(__file__).parent.parent.parent / "shared" / "data" / "plans"
 SCHOOLS = sorted(PLANS.glob("*.xml"))

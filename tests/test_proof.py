@@ -18,8 +18,8 @@ from test_speedups import machines
 from worlds import rectangle
 
 from ssh_abduction import MapError, OnlineMapper, Search, Theory, Trace, solve
+from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli import main
-from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.steps.apart import Continuations
 from ssh_abduction.steps.log import Log
 

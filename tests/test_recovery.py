@@ -16,7 +16,7 @@ from test_faults import cheapest, small_traces, told
 
 from ssh_abduction import Belief, OnlineMapper, Solution, Speedups, Status, Theory, TheoryError, Trace, TraceError, solve
 from ssh_abduction.asp.process import _under_way
-from ssh_abduction.judge.checker import check
+from ssh_abduction.checker.checker import check
 from ssh_abduction.online import recovery
 from ssh_abduction.online.meanwhile import Meanwhile
 from ssh_abduction.online.rivals import Rival, Scale

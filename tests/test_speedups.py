@@ -22,6 +22,7 @@ from strategies import traces
 from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, solve
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import LimitError
+from ssh_abduction.checker.checker import check
 from ssh_abduction.engines import base as engine
 from ssh_abduction.engines import framed
 from ssh_abduction.engines import naming as named
@@ -29,7 +30,6 @@ from ssh_abduction.engines.nearby import NearbySearch
 from ssh_abduction.guesses import annealing
 from ssh_abduction.guesses.annealing import annealed_steps
 from ssh_abduction.guesses.merging import merged, thinned
-from ssh_abduction.judge.checker import check
 from ssh_abduction.solver import search as solver
 from ssh_abduction.steps.apart import Continuations, clique
 from ssh_abduction.steps.chart import Chart

@@ -13,10 +13,10 @@ from test_property import LIMIT, agree
 from worlds import TOURS, drive
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
+from ssh_abduction.checker.checker import check
+from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import TraceError
-from ssh_abduction.judge.checker import check
-from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.rivals.compare import compare
 from ssh_abduction.rivals.explore import next_experiment
 from ssh_abduction.theory.speedups import TABLE

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
 
 from ssh_abduction import Cost, SolverError, Status, Theory, Trace, solve
+from ssh_abduction.checker.checker import check
+from ssh_abduction.checker.claims import false_claims
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.judge.checker import check
-from ssh_abduction.judge.claims import false_claims
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.search import Search
 from ssh_abduction.theory.rules import Rules

@@ -7,14 +7,14 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from ssh_abduction.checker.checker import check, unchecked
+from ssh_abduction.checker.claims import false_claims
+from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import MapError, brief, is_finite, printable
 from ssh_abduction.data.maps import SSHMap, maps_of, read_json
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.judge.checker import check, unchecked
-from ssh_abduction.judge.claims import false_claims
-from ssh_abduction.judge.proof import check_bound
 from ssh_abduction.solver.ranking import Ranking
 from ssh_abduction.solver.result import Solution, summary_of
 from ssh_abduction.solver.sharing import Sharing

@@ -59,13 +59,13 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.asp.limits import check_limit
+from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace, View
 from ssh_abduction.engines.base import AT_ONCE, Cost
 from ssh_abduction.guesses.tree import Sketch
-from ssh_abduction.judge.checker import check, unchecked
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.result import Seconds, Solution, Status
 from ssh_abduction.solver.search import ALL, Search

@@ -31,10 +31,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.engines.base import cost_as_counted
-from ssh_abduction.judge.checker import check
 from ssh_abduction.localize import Belief, Chances, Localiser
 from ssh_abduction.online.meanwhile import Meanwhile, Solved, solved
 from ssh_abduction.online.rivals import Rival, Scale

@@ -10,12 +10,12 @@ from dataclasses import replace
 
 from ssh_abduction.asp import facts
 from ssh_abduction.asp.limits import LAST, LimitError, StageTimeError
+from ssh_abduction.checker.checker import turned
 from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.engines.base import Engine, Found, Task
 from ssh_abduction.engines.refusing import first_accepted
 from ssh_abduction.engines.stepwise import StepEngine, paths_needed
-from ssh_abduction.judge.checker import turned
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.result import Status

@@ -10,6 +10,7 @@ from typing import Any, overload
 
 from ssh_abduction.asp.control import Grounding
 from ssh_abduction.asp.limits import Stop
+from ssh_abduction.checker.claims import contradictions
 from ssh_abduction.data import cards
 from ssh_abduction.data.errors import MapError, brief, checked_index, named
 from ssh_abduction.data.files import json_line
@@ -27,7 +28,6 @@ from ssh_abduction.data.maps import (
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted, shortly
 from ssh_abduction.engines.base import Cost, cost_as_counted
-from ssh_abduction.judge.claims import contradictions
 from ssh_abduction.solver.backbone import Rivals
 from ssh_abduction.solver.ranking import weights
 from ssh_abduction.solver.recorded import (

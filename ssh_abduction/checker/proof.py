@@ -1,7 +1,7 @@
 """Checks the proof that no map of a trace has fewer dstates, in plain Python that shares nothing with the solver.
 
 >>> from ssh_abduction import Trace
->>> from ssh_abduction.judge.proof import check_bound
+>>> from ssh_abduction.checker.proof import check_bound
 >>> trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
 >>> check_bound(trace, {"clique": [0, 1, 2, 3], "words": [[0, 2, ["travel"]]], "refuted": []})
 ProvenBound(dstates=4, refuted=(), faults=())

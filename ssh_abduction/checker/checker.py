@@ -1,7 +1,7 @@
 """Checks a map against a trace and a theory, axiom by axiom, in plain Python that shares nothing with the solver.
 
 >>> from ssh_abduction import Trace
->>> from ssh_abduction.judge.checker import check
+>>> from ssh_abduction.checker.checker import check
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> from ssh_abduction.theory.theory import Theory
 >>> trace = Trace.from_steps(["a", "b"], ["travel"])
@@ -25,13 +25,13 @@ from functools import cached_property, partial
 from graphlib import CycleError, TopologicalSorter
 from typing import TypeAlias
 
+from ssh_abduction.checker.gateways import Clash, Sight, clashes, headings, may_show_the_same
+from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import Openings, Star
 from ssh_abduction.data.trace import Action, Trace, View, checked_trace
-from ssh_abduction.judge.gateways import Clash, Sight, clashes, headings, may_show_the_same
-from ssh_abduction.judge.planarity import Edges
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 COHERENCE = "map_explains_trace"
@@ -975,7 +975,7 @@ def _star_of_dstate(m: _Reading) -> Found:
 
 def _one_pose(m: _Reading) -> Found:
     """A dstate has one pose, a place one position, with which the displacements agree within their covariance."""
-    from ssh_abduction.judge.geometry import refused_returns  # loads numpy
+    from ssh_abduction.checker.geometry import refused_returns  # loads numpy
 
     trusted = m.trace.without_displacements_at([fault.step for fault in m.map.faults if fault.kind == "jumped"])
     for refused in refused_returns(trusted, m.map, m.theory):

@@ -1,6 +1,6 @@
 """Compares what a file of maps says of itself with the maps and the proof that are in it.
 
->>> from ssh_abduction.judge.claims import false_claims
+>>> from ssh_abduction.checker.claims import false_claims
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> from ssh_abduction.theory.theory import Theory
 >>> one = SSHMap((0,), (DState(0, "a"),), ())
