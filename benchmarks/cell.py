@@ -30,9 +30,9 @@ from suite import INSTANCES
 from table import OURS, WITHOUT
 
 from ssh_abduction import Search, Solution, Speedups, Theory, Trace
-from ssh_abduction.asp import limits
-from ssh_abduction.asp.limits import peak_memory
 from ssh_abduction.checker.checker import check
+from ssh_abduction.solver.asp import limits
+from ssh_abduction.solver.asp.limits import peak_memory
 from ssh_abduction.solver.result import Status
 
 AROUND = 300  # seconds for all that the clock does not count
@@ -117,7 +117,7 @@ def all_but(names: str) -> Speedups:
     off = names.split(",")
     if "following" in off:
         off.remove("following")
-        naming = importlib.import_module("ssh_abduction.engines.naming")
+        naming = importlib.import_module("ssh_abduction.solver.engines.naming")
         naming.NamedLabels._from_beginning = lambda *_: iter(())
     return Speedups.without(off)
 

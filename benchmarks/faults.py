@@ -36,7 +36,7 @@ from fault_peers import PEERS
 from scipy.optimize import linear_sum_assignment
 
 from ssh_abduction import Progress, Search, SSHMap, Status, Theory
-from ssh_abduction.asp import limits
+from ssh_abduction.solver.asp import limits
 
 OURS, TOLD = "ssh-abduction", "ssh-abduction, told the kind"
 SOLVERS = (OURS, TOLD, *PEERS)

@@ -19,7 +19,7 @@ from instances import maze
 from truth import NOISE
 
 import ssh_abduction.checker.geometry
-import ssh_abduction.fit
+import ssh_abduction.solver.fit
 from ssh_abduction import Odometry, Theory, Trace, solve
 from ssh_abduction.solver.result import Status
 from ssh_abduction.theory.evidence import displacement
@@ -30,7 +30,7 @@ BEGINS = (
     (displacement.Displacement, "refuse"),
     (displacement, "count_returns"),
     (ssh_abduction.checker.geometry, "refused_returns"),
-    (ssh_abduction.fit, "fit"),
+    (ssh_abduction.solver.fit, "fit"),
 )
 
 

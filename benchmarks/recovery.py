@@ -26,8 +26,8 @@ from fault_cases import CAUSAL, MARGIN, TOPOLOGICAL, Case, is_true, rectangle_of
 from instances import Walk
 
 from ssh_abduction import Cost, OnlineMapper, SSHMap, Theory, Trace
-from ssh_abduction.asp import facts
 from ssh_abduction.online.rivals import Rival
+from ssh_abduction.solver.asp import facts
 
 COLUMNS = (
     "noticed",

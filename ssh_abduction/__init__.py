@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from ssh_abduction.data.maps import DState, Fit, Path, Pose, SSHMap
     from ssh_abduction.data.odometry import Odometry
     from ssh_abduction.data.trace import Action, Step, Trace
-    from ssh_abduction.engines.base import Cost
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, VisitsEvaluation, evaluate, evaluate_visits
     from ssh_abduction.explorer import Exploration, Explorer
     from ssh_abduction.localize import Belief, Chances, Localiser
@@ -26,17 +25,18 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.page.html import Page, view_page
     from ssh_abduction.routes import Move, Route, route
     from ssh_abduction.rungs import Rung, ladder
+    from ssh_abduction.solver.engines.base import Cost
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
     from ssh_abduction.solver.sharing import Backbone
-    from ssh_abduction.steps.certificate import Certificate
+    from ssh_abduction.solver.steps.certificate import Certificate
     from ssh_abduction.theory.speedups import Speedups
     from ssh_abduction.theory.theory import Theory
 
     __version__: str
 
 _HOMES = {  # module: the names that it exports
-    "engines.base": ("Cost",),
+    "solver.engines.base": ("Cost",),
     "data.errors": ("LocaliserError", "MapError", "RangeError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "VisitsEvaluation", "evaluate", "evaluate_visits"),
     "output.export.formats": ("export_map",),
@@ -55,7 +55,7 @@ _HOMES = {  # module: the names that it exports
     "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
     "solver.sharing": ("Backbone",),
-    "steps.certificate": ("Certificate",),
+    "solver.steps.certificate": ("Certificate",),
     "theory.speedups": ("Speedups",),
     "theory.theory": ("Theory",),
     "data.trace": ("Action", "Step", "Trace"),

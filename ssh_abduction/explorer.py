@@ -29,7 +29,6 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, TypeAlias
 
-from ssh_abduction.asp.limits import check_limit
 from ssh_abduction.data.checks import a_function
 from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
@@ -40,6 +39,7 @@ from ssh_abduction.online.mapper import OnlineMapper
 from ssh_abduction.rivals.explore import Experiment, next_experiment
 from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.rivals.tour import next_tour
+from ssh_abduction.solver.asp.limits import check_limit
 from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory, checked_theory

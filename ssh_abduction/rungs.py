@@ -16,11 +16,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ssh_abduction.asp.limits import check_limit
 from ssh_abduction.data.checks import a_flag, a_whole_number, an_instance
 from ssh_abduction.data.errors import MapError, SolverError, TheoryError
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.evaluation import Evaluation, evaluate, tells_names
+from ssh_abduction.solver.asp.limits import check_limit
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
 from ssh_abduction.theory.theory import Theory, checked_theory

@@ -18,14 +18,14 @@ from worlds import HEADINGS, QUARTERS, TWO_BLOCKS, Streets, drive, rectangle
 
 from benchmarks.instances import maze
 from ssh_abduction import Odometry, OnlineMapper, Search, Status, Theory, Trace, difference, solve
-from ssh_abduction.asp.limits import Watch
 from ssh_abduction.cli import main
 from ssh_abduction.data.words import counted
-from ssh_abduction.engines.framed import FramedEngine
-from ssh_abduction.engines.frameless import FramelessEngine
-from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver import search as solver
+from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.solver.engines.framed import FramedEngine
+from ssh_abduction.solver.engines.frameless import FramelessEngine
+from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.result import summary_of
 from ssh_abduction.solver.sharing import Backbone, Shared
 

@@ -15,12 +15,12 @@ from ssh_abduction import Status, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.clock import each_heeding, heeding, look_at_clock
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.fit import fit
-from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.solver import candidates
 from ssh_abduction.solver import search as solver
+from ssh_abduction.solver.fit import fit
+from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
-from ssh_abduction.steps.certificate import Certificate
+from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.theory.evidence import Planar
 
 TURNED = {"right": -math.pi / 2, "left": math.pi / 2, "around": math.pi}
@@ -135,7 +135,7 @@ def test_a_certificate_is_written_without_a_look_at_each_pair() -> None:
     """Of 3,000 steps that show different views no pair needs a word."""
     trace = Trace.from_steps([*range(3000), 0, 1], ["travel"] * 3000 + ["right"])
     asked = []
-    with patch("ssh_abduction.steps.certificate._word", side_effect=lambda *pair: asked.append(pair) or ("travel",)):
+    with patch("ssh_abduction.solver.steps.certificate._word", side_effect=lambda *pair: asked.append(pair) or ("travel",)):
         written = Certificate((*range(3000), 3001)).to_dict(trace)
     assert [pair[1:] for pair in asked] == [(1, 3001)]
     assert written["words"] == [[1, 3001, ["travel"]]]

@@ -29,11 +29,11 @@ from ssh_abduction.cli import main
 from ssh_abduction.cli import solve as solving
 from ssh_abduction.cli.text import compared
 from ssh_abduction.data.maps import DState, Fault, Fit, Path
-from ssh_abduction.engines import framed, naming
 from ssh_abduction.rivals.compare import Matter, Question
 from ssh_abduction.rivals.factors import deciding, independent
 from ssh_abduction.rivals.table import Table
 from ssh_abduction.solver import search as searching
+from ssh_abduction.solver.engines import framed, naming
 from ssh_abduction.solver.sharing import Backbone, Sharing
 
 ACES3 = "examples/aces3-route.jsonl"

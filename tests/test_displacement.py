@@ -17,9 +17,9 @@ from strategies import theories, traces
 from test_property import agree
 
 from ssh_abduction import DState, Odometry, SSHMap, Theory, TheoryError, Trace, solve
-from ssh_abduction.asp.facts import causal_map
 from ssh_abduction.checker.checker import check
-from ssh_abduction.fit import _Problem, fit
+from ssh_abduction.solver.asp.facts import causal_map
+from ssh_abduction.solver.fit import _Problem, fit
 from ssh_abduction.solver.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
 
 from ssh_abduction import Status, Theory, Trace, TraceError, solve
-from ssh_abduction.asp import facts
 from ssh_abduction.cli import main
 from ssh_abduction.explain import Axioms, Piece
 from ssh_abduction.rivals.derivation import Derivation
 from ssh_abduction.rivals.explain import PairExplanation, Verdict, explain_pair, explain_trace
+from ssh_abduction.solver.asp import facts
 from ssh_abduction.theory.encodings import axioms
 
 RECTANGLE = Trace.load(Path(__file__).parent.parent / "examples" / "notched-rectangle.jsonl")

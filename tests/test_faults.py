@@ -23,12 +23,12 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import Fault, SSHMap
-from ssh_abduction.engines import faulty
-from ssh_abduction.engines.base import Task
-from ssh_abduction.engines.blocks import Blocks
-from ssh_abduction.front import fault_front
-from ssh_abduction.guesses.robust import Explainer
 from ssh_abduction.solver import search
+from ssh_abduction.solver.engines import faulty
+from ssh_abduction.solver.engines.base import Task
+from ssh_abduction.solver.engines.blocks import Blocks
+from ssh_abduction.solver.front import fault_front
+from ssh_abduction.solver.guesses.robust import Explainer
 
 Told = tuple[tuple[int, ...], frozenset[tuple[int, str, object]]]  # the labels of the steps, and the faults
 

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from benchmarks.instances import maze
 from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.asp import facts
 from ssh_abduction.checker.checker import check
-from ssh_abduction.guesses import continuing as following
-from ssh_abduction.guesses.continuing import followed
-from ssh_abduction.guesses.merging import thinned
-from ssh_abduction.steps.chart import Chart, numbered
-from ssh_abduction.steps.log import Log
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.guesses import continuing as following
+from ssh_abduction.solver.guesses.continuing import followed
+from ssh_abduction.solver.guesses.merging import thinned
+from ssh_abduction.solver.steps.chart import Chart, numbered
+from ssh_abduction.solver.steps.log import Log
 from tests.strategies import traces
 
 CAUSAL = Theory.causal()

@@ -16,27 +16,27 @@ from instances import Walk, maze
 from strategies import STARS
 
 from ssh_abduction import OnlineMapper, Search, Speedups, Status, Theory, Trace, solve
-from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.engines import base as engine
-from ssh_abduction.engines import framed
-from ssh_abduction.engines import paths as paths_module
-from ssh_abduction.engines import visits as same
-from ssh_abduction.engines.base import Cost, Found
-from ssh_abduction.engines.framed import FramedEngine
-from ssh_abduction.engines.nearby import Beside, NearbySearch
-from ssh_abduction.engines.sides import FramedSides
-from ssh_abduction.engines.visits import OPEN, VisitLabels
-from ssh_abduction.guesses import annealing
-from ssh_abduction.guesses.annealing import Guess, attempts
-from ssh_abduction.guesses.merging import kept, merged_near
 from ssh_abduction.solver import search as solver
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.engines import base as engine
+from ssh_abduction.solver.engines import framed
+from ssh_abduction.solver.engines import paths as paths_module
+from ssh_abduction.solver.engines import visits as same
+from ssh_abduction.solver.engines.base import Cost, Found
+from ssh_abduction.solver.engines.framed import FramedEngine
+from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
+from ssh_abduction.solver.engines.sides import FramedSides
+from ssh_abduction.solver.engines.visits import OPEN, VisitLabels
+from ssh_abduction.solver.guesses import annealing
+from ssh_abduction.solver.guesses.annealing import Guess, attempts
+from ssh_abduction.solver.guesses.merging import kept, merged_near
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.steps.chart import QUARTERS, Chart, FramedChart, numbered
-from ssh_abduction.steps.log import Log
+from ssh_abduction.solver.steps.chart import QUARTERS, Chart, FramedChart, numbered
+from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import SPEEDUPS
 

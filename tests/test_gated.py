@@ -11,11 +11,11 @@ import pytest
 
 from benchmarks.instances import maze
 from ssh_abduction import Status, Theory, Trace, solve
-from ssh_abduction.asp.own import can_be_asked, keeps_own_rules
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.guesses.gated import gated_map
 from ssh_abduction.solver import search as solver
+from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
+from ssh_abduction.solver.guesses.gated import gated_map
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.rules import Rules
 

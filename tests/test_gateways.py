@@ -24,7 +24,7 @@ from ssh_abduction.data.maps import maps_of, read_json
 from ssh_abduction.data.star import Frame, Gateway, Star
 from ssh_abduction.data.trace import Action, Step
 from ssh_abduction.solver import prefixes
-from ssh_abduction.steps import frames
+from ssh_abduction.solver.steps import frames
 from ssh_abduction.theory.speedups import Speedups
 
 GATEWAYS = Theory(star="gateways")

@@ -8,11 +8,11 @@ from unittest.mock import patch
 import pytest
 
 from ssh_abduction import Status, Theory, Trace, solve
-from ssh_abduction.asp.facts import Segments
-from ssh_abduction.engines import frameless
-from ssh_abduction.engines.frameless import PlacesAndPaths
-from ssh_abduction.engines.homes import fewest_paths, homes_of
 from ssh_abduction.solver import search as solver
+from ssh_abduction.solver.asp.facts import Segments
+from ssh_abduction.solver.engines import frameless
+from ssh_abduction.solver.engines.frameless import PlacesAndPaths
+from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
 PLAIN = Speedups.without(SPEEDUPS)

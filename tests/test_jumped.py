@@ -18,8 +18,8 @@ from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.odometry import in_words
 from ssh_abduction.explain import explain
-from ssh_abduction.front import fault_front
-from ssh_abduction.guesses.jumps import wrong_displacements
+from ssh_abduction.solver.front import fault_front
+from ssh_abduction.solver.guesses.jumps import wrong_displacements
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 AHEAD, LEFT, AWAY = (10.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2), (25.0, 7.0, 0.9)

@@ -18,14 +18,14 @@ from limits import Case, cases, outcome
 from worlds import rectangle
 
 from ssh_abduction import Search, Status, Theory, Trace, solve
-from ssh_abduction.asp import workers
-from ssh_abduction.asp.control import Control
-from ssh_abduction.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.explain import Axioms, Interrupted, Piece
+from ssh_abduction.solver.asp import workers
+from ssh_abduction.solver.asp.control import Control
+from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.solver.candidates import Candidates
-from ssh_abduction.steps import certificate
-from ssh_abduction.steps.noise import noise_in
+from ssh_abduction.solver.steps import certificate
+from ssh_abduction.solver.steps.noise import noise_in
 
 # Seconds in which what has to end soon has ended also on a slow machine that has much else to do. What does not heed its limit takes longer than that. How many
 # seconds an end takes beyond the limit is measured by benchmarks/limits.py.
@@ -267,7 +267,7 @@ def test_what_is_given_up_is_answered_and_nothing_begins() -> None:
 @POSIX
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "pid"
-    program = f"from ssh_abduction.asp import workers; from test_limits import stay; list(workers.answers(stay, [(0, {str(path)!r})], 1, bool, None, 1.0))"
+    program = f"from ssh_abduction.solver.asp import workers; from test_limits import stay; list(workers.answers(stay, [(0, {str(path)!r})], 1, bool, None, 1.0))"
     with subprocess.Popen([sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}) as parent:
         while not (path.exists() and path.read_text()):
             assert parent.poll() is None

@@ -11,16 +11,16 @@ import pytest
 
 from benchmarks.instances import Walk, maze
 from ssh_abduction import Search, Theory, solve
-from ssh_abduction.asp.limits import Watch
 from ssh_abduction.checker.checker import check
-from ssh_abduction.engines import paths as paths_module
-from ssh_abduction.engines import visits as same
-from ssh_abduction.engines.framed import FramedEngine
-from ssh_abduction.engines.paths import Paths
-from ssh_abduction.guesses import annealing
-from ssh_abduction.steps.chart import Chart, FramedChart, numbered
-from ssh_abduction.steps.localising import Located, State, faced, located, states_of, tracked
-from ssh_abduction.steps.log import Log
+from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.solver.engines import paths as paths_module
+from ssh_abduction.solver.engines import visits as same
+from ssh_abduction.solver.engines.framed import FramedEngine
+from ssh_abduction.solver.engines.paths import Paths
+from ssh_abduction.solver.guesses import annealing
+from ssh_abduction.solver.steps.chart import Chart, FramedChart, numbered
+from ssh_abduction.solver.steps.localising import Located, State, faced, located, states_of, tracked
+from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.speedups import Speedups
 
 FRAMED = Theory(star="frame")

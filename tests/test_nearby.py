@@ -16,21 +16,21 @@ from instances import maze, moore
 from test_speedups import PLAIN, machines
 
 from ssh_abduction import Speedups, Status, Theory, Trace, solve
-from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.checker.checker import check
-from ssh_abduction.engines import base as engine
-from ssh_abduction.engines import naming as named
-from ssh_abduction.engines import nearby
-from ssh_abduction.engines.base import Found
-from ssh_abduction.engines.causal import CausalEngine
-from ssh_abduction.engines.nearby import Beside, NearbySearch
-from ssh_abduction.guesses import annealing
-from ssh_abduction.guesses.annealing import annealed
 from ssh_abduction.solver import search as solver
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.engines import base as engine
+from ssh_abduction.solver.engines import naming as named
+from ssh_abduction.solver.engines import nearby
+from ssh_abduction.solver.engines.base import Found
+from ssh_abduction.solver.engines.causal import CausalEngine
+from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
+from ssh_abduction.solver.guesses import annealing
+from ssh_abduction.solver.guesses.annealing import annealed
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.steps.chart import Chart
-from ssh_abduction.steps.log import Log
+from ssh_abduction.solver.steps.chart import Chart
+from ssh_abduction.solver.steps.log import Log
 
 CAUSAL = Theory.causal()
 

@@ -13,11 +13,11 @@ from instances import maze, moore, rectangle
 
 from ssh_abduction import DState, MapError, SolverError, SSHMap, Theory, Trace, next_experiment, solve
 from ssh_abduction import Path as MapPath
-from ssh_abduction.asp.limits import Watch
 from ssh_abduction.cli import main
 from ssh_abduction.rivals.consequences import Consequences
 from ssh_abduction.rivals.explore import Experiment, Plan
 from ssh_abduction.rivals.machines import Seen, links_of
+from ssh_abduction.solver.asp.limits import Watch
 
 ROOT = Path(__file__).parent.parent
 ACES = str(ROOT / "examples" / "aces3-route.jsonl")

@@ -22,13 +22,13 @@ from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Action, Odometry, OnlineMapper, Solution, SSHMap, Status, Step, Theory, TheoryError, Trace, TraceError, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.engines.base import Task
-from ssh_abduction.guesses import annealing
-from ssh_abduction.guesses.tree import Sketch
 from ssh_abduction.online import background as guessing
 from ssh_abduction.online import mapper as online
-from ssh_abduction.steps.chart import Chart
-from ssh_abduction.steps.log import Log
+from ssh_abduction.solver.engines.base import Task
+from ssh_abduction.solver.guesses import annealing
+from ssh_abduction.solver.guesses.tree import Sketch
+from ssh_abduction.solver.steps.chart import Chart
+from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.speedups import Speedups
 
 NO_TIME = 1e-9  # seconds: every search is stopped before it begins

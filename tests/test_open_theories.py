@@ -22,13 +22,13 @@ from ssh_abduction import OnlineMapper, Search, Speedups, SSHMap, Status, Theory
 from ssh_abduction.checker import check
 from ssh_abduction.checker.checker import unchecked
 from ssh_abduction.cli import main
-from ssh_abduction.engines.causal import CausalEngine
-from ssh_abduction.engines.framed import FramedEngine
-from ssh_abduction.engines.frameless import FramelessEngine
-from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.explain import explain
 from ssh_abduction.online import mapper as mapper_module
 from ssh_abduction.solver import judging, prefixes, search
+from ssh_abduction.solver.engines.causal import CausalEngine
+from ssh_abduction.solver.engines.framed import FramedEngine
+from ssh_abduction.solver.engines.frameless import FramelessEngine
+from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import InternalError
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs

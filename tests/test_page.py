@@ -35,7 +35,6 @@ from ssh_abduction import (
     solve,
     view_page,
 )
-from ssh_abduction.asp.process import _under_way
 from ssh_abduction.cli import main
 from ssh_abduction.cli.options import add_theory, flags_of, theory_of
 from ssh_abduction.data.maps import Fault, Fit, Pose
@@ -47,6 +46,7 @@ from ssh_abduction.rivals.page.content import DRAWN, content_of
 from ssh_abduction.rivals.page.html import Page
 from ssh_abduction.rivals.page.images import ALPHABET, LOST, beams_of, drawn_images
 from ssh_abduction.rivals.page.server import PageServer
+from ssh_abduction.solver.asp.process import _under_way
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ROUTE = EXAMPLES / "aces3-route.jsonl"

@@ -15,11 +15,11 @@ import pytest
 from instances import maze
 
 from ssh_abduction import Theory
-from ssh_abduction.asp.limits import LimitError, Watch, peak_memory
-from ssh_abduction.asp.process import in_process
-from ssh_abduction.engines.paths import Paths
-from ssh_abduction.steps.chart import Chart
-from ssh_abduction.steps.log import Log
+from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
+from ssh_abduction.solver.asp.process import in_process
+from ssh_abduction.solver.engines.paths import Paths
+from ssh_abduction.solver.steps.chart import Chart
+from ssh_abduction.solver.steps.log import Log
 
 
 def double_and_tell_where(values: list[int], watch: Watch) -> tuple[list[int], int]:
@@ -104,8 +104,8 @@ def test_a_process_ends_with_the_one_that_waits_for_it(tmp_path: Path) -> None:
     path = tmp_path / "written"
     program = f"""
 from pathlib import Path
-from ssh_abduction.asp.limits import Watch
-from ssh_abduction.asp.process import in_process
+from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.solver.asp.process import in_process
 from test_process import write_again_and_again
 in_process(write_again_and_again, Path({str(path)!r}), watch=Watch())
 """

@@ -18,13 +18,13 @@ import pytest
 from aces import ACES
 
 from ssh_abduction import Solution, SSHError, Theory, Trace
-from ssh_abduction.asp import process, workers
-from ssh_abduction.asp.limits import Watch
 from ssh_abduction.cli import main
 from ssh_abduction.data import program
 from ssh_abduction.log_maps import LogMapping
 from ssh_abduction.reproduce import report
 from ssh_abduction.rungs import UnderWay
+from ssh_abduction.solver.asp import process, workers
+from ssh_abduction.solver.asp.limits import Watch
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="sends signals, which Windows has none of")
 SOON = 60  # seconds in which what has to end soon has ended also on a slow machine that has much else to do
@@ -197,7 +197,7 @@ def test_temporary_files_of_workers_go_with_them(tmp_path: Path) -> None:
     """Also where their parent is killed."""
     told = tmp_path / "told"
     script = f"""
-from ssh_abduction.asp import workers
+from ssh_abduction.solver.asp import workers
 from test_program import leave_a_temporary_file
 list(workers.answers(leave_a_temporary_file, [(0, {str(told)!r})], 1, lambda: False, None, 1.0))
 """

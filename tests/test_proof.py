@@ -20,8 +20,8 @@ from worlds import rectangle
 from ssh_abduction import MapError, OnlineMapper, Search, Theory, Trace, solve
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli import main
-from ssh_abduction.steps.apart import Continuations
-from ssh_abduction.steps.log import Log
+from ssh_abduction.solver.steps.apart import Continuations
+from ssh_abduction.solver.steps.log import Log
 
 
 @settings(max_examples=20)

@@ -39,19 +39,19 @@ from ssh_abduction import (
     TraceError,
     solve,
 )
-from ssh_abduction.asp.facts import links_of
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.errors import SSHError
-from ssh_abduction.engines import base as engine_module
-from ssh_abduction.engines import stepwise
-from ssh_abduction.engines.base import Found, Task
-from ssh_abduction.engines.causal import CausalEngine
-from ssh_abduction.engines.framed import FramedEngine
 from ssh_abduction.explain import Interrupted, explain
 from ssh_abduction.learner import BootstrapLearner
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver import search as solver_module
-from ssh_abduction.steps.log import Log, Outcome
+from ssh_abduction.solver.asp.facts import links_of
+from ssh_abduction.solver.engines import base as engine_module
+from ssh_abduction.solver.engines import stepwise
+from ssh_abduction.solver.engines.base import Found, Task
+from ssh_abduction.solver.engines.causal import CausalEngine
+from ssh_abduction.solver.engines.framed import FramedEngine
+from ssh_abduction.solver.steps.log import Log, Outcome
 
 TRACE = rectangle(8)
 MAP = solve(TRACE).maps[0]

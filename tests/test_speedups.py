@@ -20,20 +20,20 @@ from instances import maze, moore
 from strategies import traces
 
 from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, solve
-from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import LimitError
 from ssh_abduction.checker.checker import check
-from ssh_abduction.engines import base as engine
-from ssh_abduction.engines import framed
-from ssh_abduction.engines import naming as named
-from ssh_abduction.engines.nearby import NearbySearch
-from ssh_abduction.guesses import annealing
-from ssh_abduction.guesses.annealing import annealed_steps
-from ssh_abduction.guesses.merging import merged, thinned
 from ssh_abduction.solver import search as solver
-from ssh_abduction.steps.apart import Continuations, clique
-from ssh_abduction.steps.chart import Chart
-from ssh_abduction.steps.log import Log
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.limits import LimitError
+from ssh_abduction.solver.engines import base as engine
+from ssh_abduction.solver.engines import framed
+from ssh_abduction.solver.engines import naming as named
+from ssh_abduction.solver.engines.nearby import NearbySearch
+from ssh_abduction.solver.guesses import annealing
+from ssh_abduction.solver.guesses.annealing import annealed_steps
+from ssh_abduction.solver.guesses.merging import merged, thinned
+from ssh_abduction.solver.steps.apart import Continuations, clique
+from ssh_abduction.solver.steps.chart import Chart
+from ssh_abduction.solver.steps.log import Log
 
 NAMES = [f.name for f in fields(Speedups)]
 PLAIN = Speedups.without(NAMES)

@@ -12,17 +12,17 @@ from instances import maze
 from strategies import traces
 
 from ssh_abduction import Search, Speedups, Status, Theory, Trace, solve
-from ssh_abduction.asp.facts import most_paths
-from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.engines import frameless as ways
-from ssh_abduction.engines import naming as named
-from ssh_abduction.engines.base import Task
-from ssh_abduction.engines.frameless import FramelessEngine
-from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.solver import search as solver
+from ssh_abduction.solver.asp.facts import most_paths
+from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.engines import frameless as ways
+from ssh_abduction.solver.engines import naming as named
+from ssh_abduction.solver.engines.base import Task
+from ssh_abduction.solver.engines.frameless import FramelessEngine
+from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.speedups import SPEEDUPS

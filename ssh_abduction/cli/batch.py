@@ -21,9 +21,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
-from ssh_abduction.asp import workers
-from ssh_abduction.asp.limits import POLL
-from ssh_abduction.asp.limits import Stop as SearchStop
 from ssh_abduction.cli import EXIT_ERROR
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import theory_of
@@ -46,6 +43,9 @@ from ssh_abduction.data.errors import SolverError, SSHError, brief, named, print
 from ssh_abduction.data.program import SIGNALLED, interrupted_code
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain import Explanation
+from ssh_abduction.solver.asp import workers
+from ssh_abduction.solver.asp.limits import POLL
+from ssh_abduction.solver.asp.limits import Stop as SearchStop
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.sharing import Backbone

@@ -18,7 +18,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.ranking import Ranking
 from ssh_abduction.solver.result import Solution, summary_of
 from ssh_abduction.solver.sharing import Sharing
-from ssh_abduction.steps.certificate import RESTS_ON
+from ssh_abduction.solver.steps.certificate import RESTS_ON
 from ssh_abduction.theory.theory import Theory
 
 EXIT_VIOLATED = 20

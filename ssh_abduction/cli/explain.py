@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, read_maps, theory_of
 from ssh_abduction.cli.outcome import dump, on_ctrl_c
@@ -13,6 +12,7 @@ from ssh_abduction.data.errors import MapError, SSHError, named
 from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.rivals.explain import PairExplanation, PairQuestion, TraceExplanation, TraceQuestion, Verdict
+from ssh_abduction.solver.asp.limits import Stop
 from ssh_abduction.solver.recorded import theory_in
 from ssh_abduction.theory.theory import Theory
 

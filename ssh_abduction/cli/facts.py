@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 
-from ssh_abduction.asp.facts import program
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.asp.facts import program
 
 
 def add_parser(verbs: Verbs) -> None:

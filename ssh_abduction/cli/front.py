@@ -10,7 +10,7 @@ from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data import program
 from ssh_abduction.data.errors import SSHError
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.front import Front, fault_front
+from ssh_abduction.solver.front import Front, fault_front
 from ssh_abduction.theory.theory import Theory
 
 

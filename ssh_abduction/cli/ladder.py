@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.outcome import on_ctrl_c
@@ -15,6 +14,7 @@ from ssh_abduction.cli.text import table
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.asp.limits import Stop
 
 if TYPE_CHECKING:
     from ssh_abduction.rungs import Rung

@@ -22,8 +22,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.asp import workers
-from ssh_abduction.asp.limits import Stop, check_limit
 from ssh_abduction.cli import EXIT_ERROR, batch, unwritten
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.import_log import doors_of, named_after, reading_of
@@ -33,6 +31,8 @@ from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import SolverError, SSHError, named
 from ssh_abduction.data.files import write_file
 from ssh_abduction.data.program import SIGNALLED, interrupted_code
+from ssh_abduction.solver.asp import workers
+from ssh_abduction.solver.asp.limits import Stop, check_limit
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from ssh_abduction.asp.limits import Watch, check_limit
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
@@ -16,6 +15,7 @@ from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import maps_of, read_json
 from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.asp.limits import Watch, check_limit
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

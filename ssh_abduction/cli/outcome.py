@@ -14,10 +14,10 @@ from weakref import WeakKeyDictionary
 from ssh_abduction.data import program
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.engines.base import Cost
 from ssh_abduction.explain import Explanation, Interrupted, explain
 from ssh_abduction.runner_up import second_map
 from ssh_abduction.solver import Search, Solution, Status, result
+from ssh_abduction.solver.engines.base import Cost
 from ssh_abduction.solver.sharing import Backbone
 
 SOON = 10_000  # steps of a trace in which noise is sought after Ctrl-C, at most: in 40,000 that takes two seconds

@@ -11,7 +11,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from ssh_abduction.asp.limits import Stop
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.outcome import (
@@ -33,6 +32,7 @@ from ssh_abduction.data.logs import PROGRESS
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain import Explanation
+from ssh_abduction.solver.asp.limits import Stop
 from ssh_abduction.solver.result import Progress, Solution, Status, summary_of
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.sharing import Backbone

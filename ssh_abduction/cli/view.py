@@ -148,9 +148,9 @@ def _serve(
 ) -> int:
     import signal
 
-    from ssh_abduction.asp.process import end_all
     from ssh_abduction.data import program
     from ssh_abduction.rivals.page.server import PageServer
+    from ssh_abduction.solver.asp.process import end_all
 
     try:
         server = PageServer(listing, trace, theory, run=localised, called=called, port=options.port, limit=options.time_limit)

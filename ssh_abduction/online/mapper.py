@@ -58,18 +58,18 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.asp.limits import check_limit
 from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace, View
-from ssh_abduction.engines.base import AT_ONCE, Cost
-from ssh_abduction.guesses.tree import Sketch
+from ssh_abduction.solver.asp.limits import check_limit
+from ssh_abduction.solver.engines.base import AT_ONCE, Cost
+from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.result import Seconds, Solution, Status
 from ssh_abduction.solver.search import ALL, Search
-from ssh_abduction.steps.log import Outcome, observation
+from ssh_abduction.solver.steps.log import Outcome, observation
 from ssh_abduction.theory.evidence import NO_PAIRS, Pairs, evidence_of, pairs_of, said_by
 from ssh_abduction.theory.evidence.displacement import count_returns
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
@@ -143,7 +143,7 @@ class OnlineMapper:
             self.solution = self._recovery.solution
             return
         if theory.level == "causal":  # now rather than at the step that first needs it, as it takes its time
-            importlib.import_module("ssh_abduction.engines.causal")
+            importlib.import_module("ssh_abduction.solver.engines.causal")
         elif row("visits").holds_for(settled):
             importlib.import_module("ssh_abduction.online.background")
         began = time.perf_counter()

@@ -34,13 +34,13 @@ import numpy as np
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.engines.base import cost_as_counted
 from ssh_abduction.localize import Belief, Chances, Localiser
 from ssh_abduction.online.meanwhile import Meanwhile, Solved, solved
 from ssh_abduction.online.rivals import Rival, Scale
+from ssh_abduction.solver.engines.base import cost_as_counted
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.result import Bound, Seconds, Solution, Status
-from ssh_abduction.steps.log import observation
+from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.evidence import evidence_of, pairs_of
 from ssh_abduction.theory.speedups import Speedups, row
 from ssh_abduction.theory.theory import Theory

@@ -20,7 +20,6 @@ from simulator.laser import Laser
 from simulator.robot import Body
 from simulator.tours import simulate
 from simulator.world import World
-from ssh_abduction.asp import workers
 from ssh_abduction.data import program
 from ssh_abduction.data.errors import SSHError
 from ssh_abduction.data.files import write_file
@@ -39,6 +38,7 @@ from ssh_abduction.reproduce.claims import (
     to_dict,
     true_dstates,
 )
+from ssh_abduction.solver.asp import workers
 
 NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)  # metres
 SCALES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # times the spread that hill-climbing leaves

@@ -12,12 +12,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-from ssh_abduction.asp import facts
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.engines.base import Cost
 from ssh_abduction.explain import Axioms, Interrupted, Piece
 from ssh_abduction.rivals.explain import SMALL, UNCUT, PairExplanation, Side, Verdict
 from ssh_abduction.rivals.listing import Listing
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.engines.base import Cost
 from ssh_abduction.solver.result import Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory

@@ -19,15 +19,15 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
-from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import LimitError, Stop, Watch, check_limit
-from ssh_abduction.asp.rules import check_rules
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import SolverError, SSHError, TraceError, brief, is_whole
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View, checked_trace
-from ssh_abduction.engines.base import Cost
 from ssh_abduction.explain import Axioms, Explanation, Interrupted, Piece, explain
 from ssh_abduction.rivals.derivation import Derivation, derive
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.limits import LimitError, Stop, Watch, check_limit
+from ssh_abduction.solver.asp.rules import check_rules
+from ssh_abduction.solver.engines.base import Cost
 from ssh_abduction.solver.result import Progress, Status
 from ssh_abduction.solver.search import Search
 from ssh_abduction.theory.theory import ASSERTIONS, Theory, checked_theory

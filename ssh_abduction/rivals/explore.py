@@ -39,13 +39,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ssh_abduction.asp.limits import LimitError, Stop, Watch, check_limit
 from ssh_abduction.data.checks import a_flag, a_function, a_list, an_instance
 from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Trace, checked_trace
 from ssh_abduction.rivals.consequences import Consequence, Consequences, is_possible
 from ssh_abduction.rivals.machines import UNKNOWN, Machine, Row, Seen, Sights, Table, Walk, links_of, machine_of, with_ends
+from ssh_abduction.solver.asp.limits import LimitError, Stop, Watch, check_limit
 from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.sharing import stretches
 from ssh_abduction.theory.theory import Theory, checked_theory

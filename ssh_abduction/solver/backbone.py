@@ -21,15 +21,15 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 
-from ssh_abduction.asp.limits import LimitError, StageTimeError
 from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.engines.base import Engine, Task
-from ssh_abduction.engines.doubts import Doubt, Settled
-from ssh_abduction.engines.stepwise import StepEngine, paths_needed
+from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
+from ssh_abduction.solver.engines.base import Engine, Task
+from ssh_abduction.solver.engines.doubts import Doubt, Settled
+from ssh_abduction.solver.engines.stepwise import StepEngine, paths_needed
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.sharing import Backbone, Sharing
-from ssh_abduction.steps.log import Outcome, Replay
+from ssh_abduction.solver.steps.log import Outcome, Replay
 from ssh_abduction.theory.evidence import Equality
 
 _log = log_of(__name__)

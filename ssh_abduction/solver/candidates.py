@@ -9,14 +9,14 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
-from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.data.clock import each_looking, heeding
 from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.engines.base import Found, Task
-from ssh_abduction.guesses.gated import gated_map
-from ssh_abduction.guesses.tree import Sketch
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.engines.base import Found, Task
+from ssh_abduction.solver.guesses.gated import gated_map
+from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.theory.speedups import Speedups, row
@@ -73,7 +73,7 @@ class Candidates:
 
         Where the robot drives there and back, and most views are different, that is so. Then only places and paths remain to be found.
         """
-        from ssh_abduction.steps.apart import Continuations  # loads numpy
+        from ssh_abduction.solver.steps.apart import Continuations  # loads numpy
 
         trace, theory, log = self._task.trace, self._task.theory, self._task.log
         if (
@@ -123,7 +123,7 @@ class Candidates:
 
         speedups  those that the caller of the search has on: other ones than here may hold where places have frames
         """
-        from ssh_abduction.engines.framing import maps_with_frames  # loads numpy
+        from ssh_abduction.solver.engines.framing import maps_with_frames  # loads numpy
 
         watch = self._task.watch
         seconds = min(FRAMING, FRAMING_SHARE * watch.left())

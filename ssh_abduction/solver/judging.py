@@ -10,11 +10,11 @@ import random
 import time
 from functools import cached_property
 
-from ssh_abduction.asp.own import can_be_asked, keeps_own_rules
 from ssh_abduction.checker.checker import AXIOMS, Violation, check, unchecked, violations
 from ssh_abduction.data.errors import SSHError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
 from ssh_abduction.theory.evidence import Equality, evidence_of
 from ssh_abduction.theory.theory import Theory
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ssh_abduction.asp.limits import Stop
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.engines.base import Cost, Found, cost_as_counted
+from ssh_abduction.solver.asp.limits import Stop
+from ssh_abduction.solver.engines.base import Cost, Found, cost_as_counted
 from ssh_abduction.solver.result import Bound, Status
 from ssh_abduction.theory.theory import Theory
 

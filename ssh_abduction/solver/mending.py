@@ -19,14 +19,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
-from ssh_abduction.asp import facts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace, View
-from ssh_abduction.engines.base import Found, Task
-from ssh_abduction.engines.faulty import FaultyEngine
-from ssh_abduction.engines.framed import FramedEngine
-from ssh_abduction.guesses.jumps import wrong_displacements
-from ssh_abduction.guesses.mending import Merging
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.engines.base import Found, Task
+from ssh_abduction.solver.engines.faulty import FaultyEngine
+from ssh_abduction.solver.engines.framed import FramedEngine
+from ssh_abduction.solver.guesses.jumps import wrong_displacements
+from ssh_abduction.solver.guesses.mending import Merging
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.speedups import row

@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-from ssh_abduction.asp import facts
-from ssh_abduction.asp.control import Asker
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.engines.base import Task
-from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.solver import prefixes
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.engines.base import Task
+from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.prefixes import Prefixes

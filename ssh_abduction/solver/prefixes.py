@@ -8,18 +8,18 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 
-from ssh_abduction.asp import facts
-from ssh_abduction.asp.limits import LAST, LimitError, StageTimeError
 from ssh_abduction.checker.checker import turned
 from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.engines.base import Engine, Found, Task
-from ssh_abduction.engines.refusing import first_accepted
-from ssh_abduction.engines.stepwise import StepEngine, paths_needed
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.limits import LAST, LimitError, StageTimeError
+from ssh_abduction.solver.engines.base import Engine, Found, Task
+from ssh_abduction.solver.engines.refusing import first_accepted
+from ssh_abduction.solver.engines.stepwise import StepEngine, paths_needed
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.result import Status
-from ssh_abduction.steps.log import Outcome, Replay
+from ssh_abduction.solver.steps.log import Outcome, Replay
 from ssh_abduction.theory.evidence import Equality
 
 _log = log_of(__name__)

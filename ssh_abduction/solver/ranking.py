@@ -8,10 +8,10 @@ from dataclasses import replace
 from itertools import chain, islice
 from typing import TypeAlias
 
-from ssh_abduction.asp.limits import LimitError, Watch
 from ssh_abduction.data.clock import heeding, look_at_clock
 from ssh_abduction.data.maps import Fit, SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.theory.evidence.displacement import jumped
 
 # So many maps are ranked, at most; of a longer list those that come later stay in the order in which they are found, so that memory stays constant.
@@ -40,7 +40,7 @@ class Ranking:
 
     def fitted(self, ssh_map: SSHMap) -> SSHMap:
         """The same map, with how well it closes."""
-        from ssh_abduction.fit import fit  # loads scipy
+        from ssh_abduction.solver.fit import fit  # loads scipy
 
         key = ssh_map.labels, tuple(s.place for s in ssh_map.dstates), jumped(ssh_map)
         if key not in self._known:

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ssh_abduction.asp.control import Grounding
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import FieldReader
-from ssh_abduction.engines.base import Cost
+from ssh_abduction.solver.asp.control import Grounding
+from ssh_abduction.solver.engines.base import Cost
 from ssh_abduction.solver.sharing import Backbone
-from ssh_abduction.steps.certificate import Certificate
+from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.theory.theory import COUNTS, Theory
 
 

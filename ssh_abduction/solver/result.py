@@ -8,8 +8,6 @@ from dataclasses import asdict, dataclass, field
 from enum import Enum
 from typing import Any, overload
 
-from ssh_abduction.asp.control import Grounding
-from ssh_abduction.asp.limits import Stop
 from ssh_abduction.checker.claims import contradictions
 from ssh_abduction.data import cards
 from ssh_abduction.data.errors import MapError, brief, checked_index, named
@@ -27,8 +25,10 @@ from ssh_abduction.data.maps import (
 )
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted, shortly
-from ssh_abduction.engines.base import Cost, cost_as_counted
+from ssh_abduction.solver.asp.control import Grounding
+from ssh_abduction.solver.asp.limits import Stop
 from ssh_abduction.solver.backbone import Rivals
+from ssh_abduction.solver.engines.base import Cost, cost_as_counted
 from ssh_abduction.solver.ranking import weights
 from ssh_abduction.solver.recorded import (
     Recorded,
@@ -41,8 +41,8 @@ from ssh_abduction.solver.recorded import (
     theory_in,
 )
 from ssh_abduction.solver.sharing import Backbone, Sharing
-from ssh_abduction.steps.certificate import Basis, Certificate
-from ssh_abduction.steps.noise import LEAST, Noise
+from ssh_abduction.solver.steps.certificate import Basis, Certificate
+from ssh_abduction.solver.steps.noise import LEAST, Noise
 from ssh_abduction.theory.theory import Theory
 
 

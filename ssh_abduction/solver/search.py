@@ -47,10 +47,6 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any, get_args
 
-from ssh_abduction.asp import facts
-from ssh_abduction.asp.control import Grounding
-from ssh_abduction.asp.limits import LimitError, StageTimeError, Stop, Watch, check_limit
-from ssh_abduction.asp.rules import check_rules
 from ssh_abduction.data.checks import a_flag, an_instance, one_of
 from ssh_abduction.data.clock import each_heeding, heeding
 from ssh_abduction.data.errors import SolverError, TheoryError, brief, is_whole
@@ -58,11 +54,15 @@ from ssh_abduction.data.logs import PROGRESS, log_of
 from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
-from ssh_abduction.engines.base import AT_ONCE, Cost, Engine, Found, Task, cost_as_counted
-from ssh_abduction.engines.stepwise import StepEngine
 from ssh_abduction.solver import prefixes
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.control import Grounding
+from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop, Watch, check_limit
+from ssh_abduction.solver.asp.rules import check_rules
 from ssh_abduction.solver.backbone import Rivals
 from ssh_abduction.solver.candidates import FRAMING_SHARE, Candidates
+from ssh_abduction.solver.engines.base import AT_ONCE, Cost, Engine, Found, Task, cost_as_counted
+from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.near import NearMinimal, counted_first
@@ -70,7 +70,7 @@ from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.ranking import Ranking, in_order, noise_warning, units_warning
 from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solution, Status
 from ssh_abduction.solver.sharing import Backbone
-from ssh_abduction.steps.certificate import Basis
+from ssh_abduction.solver.steps.certificate import Basis
 from ssh_abduction.theory.evidence import evidence_of, said_by
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -212,9 +212,9 @@ class Search:
     def _new_engine(self) -> Engine:
         """The engine that suits the theory and the length of the trace."""
         if self._may_name():  # loads numpy, which takes longer than to solve a short trace
-            from ssh_abduction.engines.causal import CausalEngine
-            from ssh_abduction.engines.faulty import FaultyEngine
-            from ssh_abduction.engines.framed import FramedEngine
+            from ssh_abduction.solver.engines.causal import CausalEngine
+            from ssh_abduction.solver.engines.faulty import FaultyEngine
+            from ssh_abduction.solver.engines.framed import FramedEngine
 
             if row("named dstates with faults").holds_for(self.theory):
                 return FaultyEngine(self._task)
@@ -448,7 +448,7 @@ class Search:
         labels = self.best.labels if self.best else ()
         self._candidates.sketch()
         if self.best is not None:
-            from ssh_abduction.engines.frameless import FramelessEngine
+            from ssh_abduction.solver.engines.frameless import FramelessEngine
 
             _log.info("dstates are settled before places and paths, from a map of %d dstates", len(self.best.dstates))
             self._prefixes.go_on_with(FramelessEngine(self._task, labels), len(self.trace))

@@ -23,7 +23,7 @@ from ssh_abduction.data.checks import a_text, a_whole_number
 from ssh_abduction.data.errors import MapError, brief, is_whole
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.words import counted
-from ssh_abduction.engines.doubts import Sort
+from ssh_abduction.solver.engines.doubts import Sort
 
 Pair: TypeAlias = tuple[int, int]
 

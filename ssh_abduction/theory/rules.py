@@ -28,7 +28,7 @@ _INSIDE = re.compile(r"%\*|\*%|%[^\n]*")
 
 @dataclass(frozen=True)
 class Rules:
-    """A file of rules: its name, for messages, and its text. `ssh_abduction.asp.rules` says whether clingo can read it.
+    """A file of rules: its name, for messages, and its text. `ssh_abduction.solver.asp.rules` says whether clingo can read it.
 
     A byte order mark is dropped, and each line ends in a line feed.
     """

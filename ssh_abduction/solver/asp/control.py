@@ -1,0 +1,335 @@
+"""Asking clingo, under limits: what all engines and searches have in common."""
+
+from __future__ import annotations
+
+import atexit
+import signal
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import clingo
+
+from ssh_abduction.data.logs import log_of
+from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch, peak_memory
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.speedups import Speedups
+
+# After grounding, clasp prepares the program before it begins to solve, and cannot be stopped meanwhile. That takes about this share of the time, and of the
+# memory, that grounding took; so a search is not begun where a limit would be over by then.
+PREPARING = 0.6, 1.0
+
+SLOW = 0.05  # seconds of grounding from which on the log mentions it
+_log = log_of(__name__)
+_ONE = clingo.Number(1)
+_grounding = threading.Lock()
+_under_way: set[clingo.SolveHandle] = set()  # the searches that clingo does now, each in a thread
+
+
+@dataclass(frozen=True, slots=True)
+class Grounding:
+    """How large a ground program is."""
+
+    rules: int
+    atoms: int
+
+
+@atexit.register
+def _end_all() -> None:
+    """When Python ends, end the searches of streams that somebody still holds, as their threads would abort Python."""
+    for handle in list(_under_way):
+        handle.cancel()
+
+
+@contextmanager
+def _held_back_interrupts() -> Iterator[None]:
+    """Ctrl-C and SIGTERM take effect when this context ends. Raised while clingo starts a thread, they would leave the thread without an owner."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    held = {number: handler for number, handler in handlers.items() if callable(handler)}
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+        yield
+        return
+    caught: list[int] = []
+    for number in held:
+        signal.signal(number, lambda caught_number, _: caught.append(caught_number))
+    try:
+        yield
+    finally:
+        for number, handler in held.items():
+            signal.signal(number, handler)
+    for caught_number in caught[:1]:
+        held[signal.Signals(caught_number)](caught_number, None)
+
+
+Answer = TypeVar("Answer")
+Made = TypeVar("Made")
+
+
+class Control(clingo.Control):
+    """A clingo control without warnings.
+
+    Only one control at a time reads or grounds: two threads that do so side by side wait for each other at each symbol, which takes three times as long.
+
+    check      called now and then while clingo grounds, where an encoding has `@go_on`; what it raises ends the grounding, and the control is of no use then
+    preparing  see PREPARING
+    seconds    that clingo has grounded since it last began to solve
+    mebibytes  by which the process has grown meanwhile
+    """
+
+    def __init__(
+        self, options: Sequence[str] = (), check: Callable[[], None] = lambda: None, preparing: tuple[float, float] = PREPARING
+    ) -> None:
+        super().__init__(["--warn=none", *options])
+        self.preparing = preparing
+        self.seconds = self.mebibytes = 0.0
+        self._check = check
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """No other control reads or grounds meanwhile. While one does, this waits, and looks whether to go on."""
+        while not _grounding.acquire(timeout=POLL):
+            self._check()
+        try:
+            yield
+        finally:
+            _grounding.release()
+
+    def load(self, path: str) -> None:
+        with self._alone():
+            super().load(path)
+
+    def load_encodings(self, *names: str) -> None:
+        """Load these encodings, with the files that they share with others."""
+        for name in names:
+            for path in encodings.paths(name):
+                self.load(path)
+
+    def add(self, *program: Any) -> None:
+        with self._alone():
+            super().add(*program)
+
+    def ground(self, parts: Sequence[tuple[str, Sequence[clingo.Symbol]]] = (("base", ()),), context: Any = None) -> None:
+        asked = _Asked(self._check)
+        with self._alone():
+            self._ground_alone(parts, context, asked)
+
+    def _ground_alone(self, parts: Sequence[tuple[str, Sequence[clingo.Symbol]]], context: Any, asked: _Asked) -> None:
+        began, before = time.perf_counter(), peak_memory()
+        try:
+            super().ground(parts, context or asked)
+        except BaseException:
+            if asked.raised is not None:  # clingo raises a copy of this exception, which lacks what it holds
+                raise asked.raised from None
+            raise
+        finally:
+            seconds, mebibytes = time.perf_counter() - began, peak_memory() - before
+            self.seconds += seconds
+            self.mebibytes += mebibytes
+            if seconds > SLOW:
+                _log.debug(
+                    "clingo grounded %s in %.2f s, %.0f MiB", ", ".join(dict.fromkeys(name for name, _ in parts)), seconds, mebibytes
+                )
+
+
+class _Asked:
+    """Answers what clingo asks while it grounds (`@go_on`): whether to go on."""
+
+    def __init__(self, check: Callable[[], None]) -> None:
+        self.raised: BaseException | None = None
+        self._check = check
+        self._next = time.perf_counter() + POLL
+
+    def go_on(self, *_: clingo.Symbol) -> clingo.Symbol:
+        """1, unless `check` raises. `check` is called only now and then, as clingo may ask this millions of times."""
+        try:
+            if time.perf_counter() > self._next:
+                self._check()
+                self._next = time.perf_counter() + POLL
+        except BaseException as error:
+            self.raised = error
+            raise
+        return _ONE
+
+
+class Asker:
+    """One clingo control, and the questions to it under limits. What asks clingo has one of these.
+
+    control  the control that is asked; a new one may take its place
+    watch    the limits; another search may go on under others
+    ground_seconds, solve_seconds  the time that clingo took so far
+    """
+
+    def __init__(self, watch: Watch) -> None:
+        self.control = Control()
+        self.watch = watch
+        self.ground_seconds = 0.0
+        self.solve_seconds = 0.0
+
+    @contextmanager
+    def grounding_timed(self) -> Iterator[None]:
+        """What is done in here counts as grounding."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.ground_seconds += time.perf_counter() - began
+
+    @property
+    def grounding(self) -> Grounding:
+        """The size of the program in the last call of clingo that came to an end. To ask takes a millisecond, as clingo tells all that it counts."""
+        try:
+            program = self.control.statistics["problem"]["lp"]
+        except (RuntimeError, KeyError):  # no call came to an end
+            return Grounding(0, 0)
+        return Grounding(int(program["rules"]), int(program["atoms"]))
+
+    def answers(
+        self,
+        read: Callable[[clingo.Model], Answer],
+        mode: str,
+        models: int,
+        *,
+        assumptions: Sequence[tuple[clingo.Symbol, bool] | int] = (),
+        conflicts: int = -1,
+        on_bound: Callable[[Sequence[int]], None] | None = None,
+        control: clingo.Control | None = None,
+        until: Callable[[], bool] = lambda: False,
+        ahead: bool = False,
+    ) -> Generator[Answer, None, bool]:
+        """The answers of clingo, each read as soon as it comes. Returns whether these are all, and neither the limit of conflicts nor `until` ended the search.
+
+        read       makes a value of an answer, which clingo may change afterwards
+        mode       how clingo optimises: its option opt-mode
+        models     how many answers are asked for, 0 for all
+        conflicts  the limit, -1 for none
+        on_bound   called with each bound that clingo proves
+        control    another control than this one's own
+        until      asked now and then; where it is true, the search ends
+        ahead      let clingo search for the next answer while the caller uses this one
+        """
+        project = "no" if mode.partition(",")[0] == "opt" else "project"
+        with self._solving(control or self.control, assumptions, mode, models, project, conflicts, on_bound) as handle:
+            handle.resume()
+            while True:
+                if not self._has_come(handle, until):
+                    return False
+                model = handle.model()
+                if model is None:
+                    return bool(_result(handle, conflicts).exhausted)
+                answer = read(model)
+                if ahead:
+                    handle.resume()
+                yield answer
+                if not ahead:
+                    handle.resume()
+
+    def verdict(
+        self,
+        read: Callable[[clingo.Model], Answer],
+        assumed: Sequence[int],
+        conflicts: int = -1,
+        mode: str = "ignore",
+        until: Callable[[], bool] = lambda: False,
+    ) -> tuple[Answer | None, list[int] | None]:
+        """An answer in which these literals are true, or else a core of them. Neither, where the limit of conflicts or `until` ended the search."""
+        with self._solving(self.control, assumed, mode, 1, "no", conflicts) as handle:
+            if not self._has_come(handle, until):
+                return None, None
+            model = handle.model()
+            if model is not None:
+                return read(model), None
+            if not _result(handle, conflicts).unsatisfiable:
+                return None, None
+            known = set(assumed)
+            return None, [
+                literal for literal in handle.core() if literal in known
+            ]  # a core may also have external atoms, which clingo assumes
+
+    @contextmanager
+    def _solving(
+        self,
+        control: clingo.Control,
+        assumptions: Sequence[tuple[clingo.Symbol, bool] | int],
+        mode: str,
+        models: int,
+        project: str,
+        conflicts: int,
+        on_bound: Callable[[Sequence[int]], None] | None = None,
+    ) -> Iterator[clingo.SolveHandle]:
+        """A search of clingo in a thread of its own, which ends with this context."""
+        configuration: Any = control.configuration.solve
+        configuration.opt_mode, configuration.models, configuration.project = mode, models, project
+        configuration.solve_limit = f"{conflicts},-1"
+        if isinstance(control, Control):
+            self.watch.check(control.preparing[0] * control.seconds, control.preparing[1] * control.mebibytes)
+            control.seconds = control.mebibytes = 0.0
+        began = time.perf_counter()
+        with ExitStack() as stack:
+            with _held_back_interrupts():
+                handle = stack.enter_context(control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound))
+            self.solve_seconds += time.perf_counter() - began
+            _under_way.add(handle)
+            try:
+                yield handle
+            finally:
+                _under_way.discard(handle)
+                handle.cancel()
+
+    def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
+        """Wait until clingo has come to an answer or to an end, and return True; or until `until` holds, and return False."""
+        began = time.perf_counter()
+        try:
+            while not handle.wait(POLL):
+                self.watch.check()
+                if until():
+                    return False
+            self.watch.check()
+            return True
+        finally:
+            self.solve_seconds += time.perf_counter() - began
+
+
+def mapped(function: Callable[[Answer], Made], answers: Generator[Answer, None, bool]) -> Generator[Made, None, bool]:
+    """The results of a function for each answer. Returns what the generator of the answers returns."""
+    with closing(answers):
+        while True:
+            try:
+                answer = next(answers)
+            except StopIteration as end:
+                return bool(end.value)
+            yield function(answer)
+
+
+def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
+    """How a search ended. Raises LimitError if it was interrupted from outside, and not ended by the limit of conflicts."""
+    result = handle.get()
+    if result.interrupted and conflicts < 0:
+        raise LimitError("interrupted")
+    return result
+
+
+def new_control(encoding: str, base: str, options: Sequence[str]) -> Control:
+    """A control with an encoding, and these facts in its base."""
+    control = Control(options)
+    control.load_encodings(encoding)
+    control.add("base", [], base)
+    control.ground([("base", [])])
+    return control
+
+
+def give_threads(control: clingo.Control, *, two: bool) -> None:
+    """Let clasp search with two threads, which exchange what they learn, or with one."""
+    configuration: Any = control.configuration.solve
+    configuration.parallel_mode = "2,compete" if two else "1"
+
+
+def has_processors(speedups: Speedups) -> bool:
+    """Whether a search may have two threads."""
+    if not speedups.threads:
+        return False
+    from joblib import cpu_count  # takes its time to load
+
+    return bool(cpu_count() > 1)

@@ -1,0 +1,111 @@
+"""Whether a map keeps a user's own rules: they are grounded with all that the map says as facts.
+
+The checker knows no rules of others. But where a rule reads only what a map shows, clingo has nothing to choose but what the rules leave open themselves. So that
+takes hardly longer than to ground them.
+
+>>> from ssh_abduction import Theory, Trace, solve
+>>> from ssh_abduction.solver.asp.own import keeps_own_rules
+>>> from ssh_abduction.theory.rules import Rules
+>>> trace = Trace.from_steps("aba", ["go", "go"])
+>>> ssh_map = solve(trace, Theory.causal())[0]
+>>> rules = [Rules("own.lp", f"#program step(t). :- same(I,t), t-I > {n}.") for n in (1, 2)]
+>>> [keeps_own_rules(trace, ssh_map, Theory.causal().replace(rules=rule)) for rule in rules]
+[False, True]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from ssh_abduction.data.clock import look_at_clock
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.control import Control
+from ssh_abduction.solver.asp.limits import POLL
+from ssh_abduction.solver.asp.rules import read_by
+from ssh_abduction.theory.theory import Theory
+
+# What rules may read of a map and of a trace, if a map alone is to say whether they hold.
+SHOWN = frozenset({"is", "same", "at", "same_place", "along", "same_course", "on_some_path", "on", "before", "travel", "turn"})
+OF_TRACE = frozenset({"view", "act", "kind", "turns", "open", "axiom", "path", "prefer", "query"})
+FRAME = """
+#defined query/1. #defined violation/2. #defined is/2. #defined same/2. #defined at/2. #defined same_place/2. #defined along/3. #defined same_course/2.
+#defined on_some_path/1. #defined on/2. #defined before/3. #defined travel/1. #defined turn/2. #defined kind/2. #defined turns/2. #defined open/2.
+#defined act/2. #defined prefer/2. #defined path/1.
+#program step(t).
+:- violation(N,t), axiom(N).
+#program check(t).
+:- violation(N,t), axiom(N).
+"""
+
+
+def can_be_asked(theory: Theory) -> bool:
+    """Whether a map alone says whether the rules of a theory, whose star is settled, hold."""
+    if not theory.rules:
+        return True
+    settled = not theory.has_faults and (theory.level == "causal" or theory.path_order == "total")
+    return settled and all(read_by(rules, theory.rules) <= SHOWN | OF_TRACE for rules in theory.rules)
+
+
+def keeps_own_rules(trace: Trace, ssh_map: SSHMap, theory: Theory) -> bool:
+    """Whether a map of a whole trace keeps the user's own rules, which `can_be_asked`.
+
+    Args:
+        trace: The trace.
+        ssh_map: A map of all of its steps that satisfies all other axioms.
+        theory: Resolved for the trace.
+    """
+    if not theory.rules:
+        return True
+    control = Control(check=look_at_clock)
+    steps = range(len(trace))
+    control.add("base", [], facts.theory_facts(theory, len(ssh_map.paths)))
+    control.add("base", [], facts.trace_facts(trace, theory, 0, len(trace)))
+    control.add("base", [], "\n".join(f"{fact}." for fact in _shown(trace, ssh_map)))
+    control.add("base", [], f"query({len(trace) - 1}).\n{FRAME}")
+    control.add("base", [], facts.own_rules(theory))
+    control.ground([("base", [])])
+    for t in steps:
+        look_at_clock()
+        control.ground([("step", facts.numbers(t))])
+    control.ground([("check", facts.numbers(len(trace) - 1))])
+    with control.solve(async_=True) as handle:
+        while not handle.wait(POLL):
+            look_at_clock()
+        return bool(handle.get().satisfiable)
+
+
+def _shown(trace: Trace, ssh_map: SSHMap) -> Iterator[str]:
+    """What the encodings say of each step where they have this map. Dstates and places have the names of their first steps, and paths are numbered from 1."""
+    first: dict[int, int] = {}
+    place: dict[int, int] = {}
+    path: dict[int, tuple[int, int]] = {}  # for each path, its number, and the direction that is faced first
+    before: dict[int, list[int]] = {}  # for each dstate, and place, and course, its steps so far
+    here: dict[int, list[int]] = {}
+    along: dict[tuple[int, int], list[int]] = {}
+    for t, label in enumerate(ssh_map.labels):
+        s = ssh_map.dstates[label]
+        yield f"is({t},{first.setdefault(label, t)})"
+        yield from (f"same({i},{t})" for i in before.setdefault(label, []))
+        before[label].append(t)
+        if s.place is not None:
+            yield f"at({t},{place.setdefault(s.place, t)})"
+            yield from (f"same_place({i},{t})" for i in here.setdefault(s.place, []))
+            here[s.place].append(t)
+        if s.path is not None and s.direction is not None:
+            number, faced = path.setdefault(s.path, (len(path) + 1, s.direction))
+            yield f"along({t},{number},{'pos' if s.direction == faced else 'neg'})"
+            yield f"on_some_path({t})"
+            yield from (f"same_course({i},{t})" for i in along.setdefault((s.path, s.direction), []))
+            along[s.path, s.direction].append(t)
+    for h in ssh_map.paths:
+        number, faced = path[h.id]
+        order = [place[p] for p in h.order[::faced]]
+        yield from (f"on({number},{p})" for p in order)
+        yield from (f"before({number},{p},{q})" for i, p in enumerate(order) for q in order[i + 1 :])
+    for t, action in enumerate(trace.actions):
+        if action.kind == "travel" and not action.slipped:
+            yield f"travel({t})"
+        elif action.turn is not None and not action.slipped:
+            yield f"turn({t},{action.turn})"

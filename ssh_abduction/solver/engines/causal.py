@@ -1,0 +1,68 @@
+"""The engine for the causal theory on long traces: labels that have names (`engines/naming.py`) are its maps."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
+from ssh_abduction.solver.engines.naming import NamedLabels
+from ssh_abduction.theory.evidence import Equality
+
+
+class CausalEngine:
+    """The causal theory, fewest dstates."""
+
+    lists_least = False
+    goes_on = True
+
+    def __init__(self, task: Task) -> None:
+        self.asker = Asker(task.watch)
+        self.intact = True
+        self.paths = 0
+        self._task = task
+        self._named = NamedLabels(task, self.asker)
+
+    @property
+    def size(self) -> int:
+        return self._named.size
+
+    @property
+    def bound(self) -> int | None:
+        return self._named.bound
+
+    def with_paths(self, paths: int) -> CausalEngine:
+        return CausalEngine(self._task)
+
+    def over(self, task: Task) -> CausalEngine:
+        return CausalEngine(task)
+
+    def next_size(self, failed: int) -> int:
+        return self._named.large_enough(next_charted_size(self.size, failed, len(self._task.trace)))
+
+    @property
+    def size_to_go_on(self) -> int:
+        return self.next_size(self.size)
+
+    def grow(self, size: int) -> None:
+        self._named.grow(size)
+
+    def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
+        return map(self._found, self._named.improving())
+
+    def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
+        return map(self._found, self._named.all_of(cost[0], enough))
+
+    def labellings(self, cost: tuple[int, ...]) -> None:
+        """Labels are the maps."""
+
+    def forbid(self, equalities: Collection[Equality]) -> bool:
+        self._named.forbid_together([(equality.first, equality.second) for equality in equalities])
+        return True
+
+    def settle(self) -> None:
+        self._named.settle()
+
+    def _found(self, labels: Sequence[int]) -> Found:
+        return Found.of(facts.causal_map(labels, self._task.trace), self._task.theory)

@@ -1,0 +1,410 @@
+"""Small maps of the causal theory near a guess, and the proof that there is none with fewer dstates, from the guess outwards.
+
+To find a map of the fewest dstates takes long where all steps are free. So most of them stay where a known map has them. Let a
+dstate be spared: if that cannot be, clingo tells which steps are in the way (a core of assumptions), and the dstates of these
+are free to change, until some steps can move or it is shown that the dstate is needed. Where that is left open, all steps of some part of the
+map are free at once, of parts as large as can be settled soon (large neighbourhood search: Shaw 1998).
+
+When each dstate is needed, nothing is assumed any more of where steps are, but still how many names each view has: no more than in the
+known map. Then views are allowed more names, one after the other, and in the end any number of dstates (the rest, see `engines/causal.py`).
+Each time clingo is asked for a map of fewer dstates in all.
+
+*Claim.* If there is none when everything is allowed, the known map is minimal.
+*Proof.* What is asked then is what `engines/causal.py` asks, at a cost of one less: by the claim there, each map of so few dstates is an
+answer. ∎
+
+To allow everything at once is to ask for a proof that may take hours; what clingo learns from each question makes the next one short. So names
+are allowed one, two, four at a time, as long as that goes well.
+
+The nodes need not be the steps of a trace: where places have frames, they are those of `Chart.framed`, and rotations are links as actions
+are. What is found then need not fit a frame, as names.lp does not know how rotations compose; but the bound holds. Names are poor at
+raising that bound core by core, which is why `engines/visits.py` has none, but good at this.
+
+In the causal theory clasp searches as its configuration `tweety` does, which proves several times as soon what its default proves; where
+places have frames its default is better, above all to list answers.
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from typing import Any, Literal, TypeAlias
+
+import clingo
+import numpy as np
+
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.control import Asker, give_threads, has_processors, new_control
+from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.steps.apart import Matrix
+from ssh_abduction.solver.steps.chart import Chart, numbered
+from ssh_abduction.theory.speedups import Speedups
+
+# After so many conflicts a question is left open, at first; each round of questions has twice as many as the one before.
+CONFLICTS = 2000
+# A question that assumes nothing of where steps are may take so many times as many conflicts, as it decides more.
+WIDE = 10
+# So many parts of the map are drawn anew in vain before anything else is tried.
+REGIONS = 40
+# Such a part has so many dstates at first, and at least.
+FIRST_REGION = 10
+# It gets so many dstates more where it is shown not to need fewer, and so many less where that was left open.
+LARGER, SMALLER = 2, 4
+# So many times as long as grounding took clingo prepares to solve, about, and cannot be stopped.
+PREPARING = 1.0
+# Clingo is given so many links in one go, as it cannot be stopped meanwhile.
+AT_A_TIME = 100
+# Clingo takes so many seconds a character, at most about, to read and ground where names lead. It cannot be stopped meanwhile.
+SECONDS_A_CHARACTER = 1e-6
+
+Labels: TypeAlias = list[int]
+_Key: TypeAlias = tuple[int, int]  # what is seen at a node, and its label
+_Verdict: TypeAlias = Literal["moved", "needed", "open"]
+
+
+class NearbySearch:
+    """Maps of the first steps near a guess.
+
+    bound  the number of dstates of the last map, once that is proven to be the least
+    """
+
+    def __init__(
+        self,
+        watch: Watch,
+        speedups: Speedups,
+        *,
+        chart: Chart,
+        clique: Sequence[int],
+        may_be: Sequence[Sequence[int]],
+        far: Callable[[int], Matrix] | None,
+        configuration: str | None = None,
+    ) -> None:
+        self.bound: int | None = None
+        self._asker = Asker(watch)
+        self._speedups = speedups
+        self._chart = chart
+        self.clique = list(clique)
+        self._may_be = may_be
+        self._far = far
+        self._configuration = configuration  # of clasp, if not its default
+        self._labels: Labels = []
+        self._needed: set[int] = set()  # names that cannot be spared
+        self._fewest: dict[int, int] = {}  # by view, spare names that are not taken back, as once they were not enough
+        self._allowed: list[int] | None = None  # names that do not help, though all are allowed; None before they were tried one by one
+        self._waiting: list[int] = []  # names yet to be allowed
+        self._region = FIRST_REGION
+        self._random = random.Random(0)
+
+    def fewer(self, guess: Sequence[int], tries: int | None = None) -> Iterator[Labels]:
+        """Labels of all steps, each time fewer. Where the iteration ends, the last are fewest if `bound` says so.
+
+        guess  a label of each step; -1 where it is not known. Need not be a map
+        tries  how often to ask with more conflicts, before it is left open whether there are fewer. None: until all is settled
+        """
+        if known := self._chart.is_map(guess):
+            yield list(guess)
+        guessed = _keys(guess, self._chart)
+        name_of = {guessed[node]: name for name, node in reversed(list(enumerate(self.clique)))}
+        extra = dict.fromkeys(key for key in guessed if key is not None and key not in name_of)  # of no step of the clique
+        counts = Counter(view for view, _ in extra)
+        self._take({view: counts[view] for view in dict.fromkeys(self._chart.seen)})
+        left = {view: iter(spare) for view, spare in self._spare.items()}
+        name_of |= {key: next(left[key[0]]) for key in extra}
+        self._labels = [-1 if key is None else name_of[key] for key in guessed]
+        # Even where the guess is a map: clasp goes on choosing as in its last answer, and so stays near.
+        for allowed in ((), [name for spare in self._spare.values() for name in spare[:-1]]):
+            verdict = self._moved(self._not_allowed(allowed), (), WIDE * CONFLICTS, step_by_step=True)
+            if verdict == "moved":
+                break
+        else:
+            return
+        if not known:
+            yield self._labels
+        conflicts, failed = CONFLICTS, 0
+        while failed != tries:
+            yield from self._spared(conflicts)
+            answer = yield from self._widened(conflicts * WIDE)
+            if answer == "needed":
+                self.bound = len(set(self._labels))
+                return
+            if answer == "open":
+                if self._allowed is None:
+                    yield from self._redrawn(CONFLICTS)
+                conflicts, failed = 2 * conflicts, failed + 1
+
+    def listed(self, watch: Watch) -> Iterator[list[int]]:
+        """All labels with as few dstates as `bound`, once that is known; the same ones now and then once more."""
+        self._asker.watch = watch
+        assert self.bound is not None
+        spares = self.bound - len(self.clique)
+        while True:
+            give_threads(self._asker.control, two=has_processors(self._speedups))
+            with closing(self._asker.answers(facts.read_names, f"enum,{spares},{spares}", 0, assumptions=[self._ordered])) as answers:
+                for answer in answers:
+                    if resting := self._rests.intersection(answer.values()):
+                        break
+                    yield numbered(answer[node] for node in range(len(answer)))
+                else:
+                    return
+            self._name_more(resting)
+
+    def _take(self, counts: Mapping[int, int]) -> None:
+        """Take a control with so many spare names for each view, one more, and a rest."""
+        began = time.perf_counter()
+        seen = self._chart.seen
+        names = [(name, seen[node]) for name, node in enumerate(self.clique)]
+        self._spare: dict[int, range] = {}
+        for view, count in counts.items():
+            self._spare[view] = range(len(names), len(names) + count + 2)
+            names += [(name, view) for name in self._spare[view]]
+        self._rests = {spare[-1] for spare in self._spare.values()}
+        pinned = set(self.clique)
+        self._choices = [options if t in pinned else [*options, *self._spare[seen[t]]] for t, options in enumerate(map(list, self._may_be))]
+        links = self._chart.links
+        base = facts.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
+        self._asker.watch.check(SECONDS_A_CHARACTER * len(base))
+        self._asker.control = new_control("names", base, ["--eq=1"])
+        if self._configuration:
+            configuration: Any = self._asker.control.configuration
+            configuration.configuration, configuration.sat_prepro = self._configuration, "no"
+        self._used = {name: self._literal(facts.used(name)) for spare in self._spare.values() for name in spare}
+        given: set[int] = set()
+        last: dict[int, int] = {}  # by view, the last step that has a choice
+        self._ordered = self._literal(facts.ordered())
+        for batch, start in enumerate(range(0, len(links), AT_A_TIME)):
+            self._asker.watch.check()
+            part, added = f"batch_{batch}", links[start : start + AT_A_TIME]
+            new = sorted({end for s, _, x in added for end in (s, x)} - given)
+            given.update(new)
+            nodes: list[tuple[int, int, Sequence[int], int | None]] = []
+            for t in new:
+                nodes.append((t, seen[t], self._choices[t], last.get(seen[t])))
+                if t not in pinned:
+                    last[seen[t]] = t
+            far = [(t, int(u)) for t in new for u in np.flatnonzero(self._far(t)[:t])] if self._far is not None else []
+            self._asker.control.add(part, [], facts.batch_facts(batch, nodes, added, far))
+            self._asker.control.ground([(part, []), ("more", facts.numbers(batch))])
+        self._asker.watch.check(PREPARING * (time.perf_counter() - began))
+
+    def _literal(self, symbol: clingo.Symbol) -> int:
+        atom = self._asker.control.symbolic_atoms[symbol]
+        assert atom is not None
+        return atom.literal
+
+    def _not_allowed(self, allowed: Collection[int]) -> list[int]:
+        """That no names are used but those of the labels, and these."""
+        taken = {*self._labels, *allowed}
+        return [-literal for name, literal in self._used.items() if name not in taken]
+
+    def _moved(self, assumed: Sequence[int], free: Iterable[int], conflicts: int, *, step_by_step: bool = False) -> _Verdict:
+        """Move steps so that this holds; those at names that are not free stay, unless they, or others at their names, are in the way."""
+        free = {-1, *free}
+        literals = self._literals()
+        while True:
+            stay = {literal: name for literal, name in zip(literals, self._labels, strict=True) if literal and name not in free}
+            answer, core = self._asker.verdict(facts.read_names, [-self._ordered, *assumed, *stay], conflicts)
+            if answer is not None:
+                self._keep(answer)
+                return "moved"
+            if core is None:
+                return "open"
+            moving = [literal for literal in core if literal in stay]
+            if not moving:
+                return "needed"
+            if step_by_step:
+                literals = [0 if literal in moving else literal for literal in literals]
+            else:
+                free |= {stay[literal] for literal in moving}
+
+    def _literals(self) -> list[int]:
+        """Of each step, that it is where its label says; 0 where there is no choice."""
+        return [
+            0 if name < 0 or len(self._choices[t]) == 1 or name not in self._choices[t] else self._literal(facts.named(t, name))
+            for t, name in enumerate(self._labels)
+        ]
+
+    def _keep(self, answer: Mapping[int, int]) -> None:
+        """Take an answer for the labels, where steps are at the first spare names of each view."""
+        taken = set(answer.values())
+        name_of = {name: name for name in range(len(self.clique))}
+        for spare in self._spare.values():
+            name_of |= dict(zip([name for name in spare if name in taken], spare, strict=False))
+        self._label([name_of[answer[t]] for t in range(len(answer))])
+
+    def _label(self, labels: Labels) -> None:
+        self._labels, self._allowed, self._needed = labels, None, set()
+
+    def _spared(self, conflicts: int) -> Iterator[Labels]:
+        """Labels with one dstate less, and again, while there is one that can be spared; only names that the labels use are allowed."""
+        tried: set[int] = set()
+        while True:
+            count = Counter(self._labels)
+            last = [max(used) for spare in self._spare.values() if (used := [name for name in spare if name in count])]
+            left = [name for name in last if name not in tried and name not in self._needed]
+            if not left:
+                return
+            name = min(left, key=lambda name: (count[name], name))
+            tried.add(name)
+            verdict = self._moved([*self._not_allowed(()), -self._used[name]], {name}, conflicts)
+            if verdict == "moved":
+                tried.clear()
+                yield self._labels
+            elif verdict == "needed":
+                self._needed.add(name)
+
+    def _redrawn(self, conflicts: int) -> Iterator[Labels]:
+        """Labels with fewer dstates where the steps of dstates that lead to each other are free, from some spare name on, and all others stay."""
+        tried = 0
+        while tried < REGIONS:
+            tried += 1
+            taken = set(self._labels)
+            begin = sorted(taken.difference(range(len(self.clique))))
+            if not begin:
+                return
+            near: dict[int, set[int]] = {}
+            for t, _, u in self._chart.links:
+                here, there = self._labels[t], self._labels[u]
+                near.setdefault(here, set()).add(there)
+                near.setdefault(there, set()).add(here)
+            edge = [self._random.choice(begin)]
+            free = set(edge)
+            while edge and len(free) < self._region:
+                for name in sorted(near[edge.pop(self._random.randrange(len(edge)))] - free)[: self._region - len(free)]:
+                    free.add(name)
+                    edge.append(name)
+            stay = [literal for literal, name in zip(self._literals(), self._labels, strict=True) if literal and name not in free]
+            answer, core = self._with_fewer([-self._ordered, *self._not_allowed(()), *stay], conflicts)
+            if answer is not None:
+                self._keep(answer)
+                yield self._labels
+                tried = 0
+            elif core is not None:
+                self._region = min(self._region + LARGER, len(taken))
+            else:
+                self._region = max(self._region - SMALLER, FIRST_REGION)
+
+    def _widened(self, conflicts: int) -> Generator[Labels, None, _Verdict]:
+        """Labels with fewer dstates, if allowing more names leads to some; "needed" if there are none whatever is allowed."""
+        if self._allowed is None:  # first no more names, then each of them alone
+            taken = set(self._labels)
+            more = [name for spare in self._spare.values() for name in spare[:-1] if name not in taken]
+            for names in ((), *((name,) for name in more)):
+                verdict = yield from self._asked(names, conflicts)
+                if verdict == "moved" or (verdict == "open" and not names):
+                    return verdict
+            self._allowed, self._waiting = [], [*more, *(spare[-1] for spare in self._spare.values())]
+        at_once = 1  # names that are allowed in one go
+        left: list[int] | None = None
+        while self._waiting and left != self._waiting:
+            left, self._waiting = self._waiting, []
+            queue = deque(left)
+            doubling = True
+            while queue:
+                added = [queue.popleft() for _ in range(min(at_once, len(queue)))]
+                verdict = yield from self._asked((*self._allowed, *added), conflicts)
+                if verdict == "moved":
+                    return verdict
+                if verdict == "needed":
+                    self._allowed += added
+                    at_once *= 1 + doubling
+                elif len(added) == 1:
+                    self._waiting += added
+                else:
+                    queue.extendleft(reversed(added))
+                    at_once, doubling = len(added) // 2, False
+        return "open" if self._waiting else "needed"
+
+    def _asked(self, allowed: Collection[int], conflicts: int) -> Generator[Labels, None, _Verdict]:
+        """Labels with fewer dstates that use these names, too."""
+        answer, core = self._with_fewer([self._ordered, *self._not_allowed(allowed)], conflicts)
+        if answer is None:
+            return "open" if core is None else "needed"
+        if resting := self._rests.intersection(answer.values()):
+            self._name_more(resting)
+        else:
+            self._keep(answer)
+            yield self._labels
+        return "moved"
+
+    def _with_fewer(self, assumed: Sequence[int], conflicts: int) -> tuple[dict[int, int] | None, list[int] | None]:
+        """An answer of fewer dstates where this holds, or a core of it."""
+        cost = len(set(self._labels)) - 1 - len(self.clique)
+        if cost < 0:
+            return None, []
+        return self._asker.verdict(facts.read_names, assumed, conflicts, f"enum,{cost},{cost}")
+
+    def _name_more(self, resting: Collection[int]) -> None:
+        """Take a control with more names for the views of these rests."""
+        before, taken = self._spare, set(self._labels)
+        used = {view: [name for name in spare if name in taken] for view, spare in before.items()}
+        self._fewest |= {view: len(spare) - 1 for view, spare in before.items() if spare[-1] in resting}
+        self._take({view: max(len(names), self._fewest.get(view, 0)) for view, names in used.items()})
+        renamed = {old: new for view, names in used.items() for old, new in zip(names, self._spare[view], strict=False)}
+        self._label([renamed.get(name, name) for name in self._labels])
+
+
+def mended(guess: Sequence[int], chart: Chart) -> list[int]:
+    """A guess at the labels of all steps, -1 where it is not known, in which they are where most like actions led, if what is seen there agrees.
+
+    Where few steps are guessed wrong, that mends them: from a right one on, all that follow are.
+    """
+    keys = _keys(guess, chart)
+    leads: dict[tuple[_Key, int], Counter[_Key]] = {}
+    for t, action, u in chart.links:
+        if (here := keys[t]) is not None and (there := keys[u]) is not None:
+            leads.setdefault((here, action), Counter())[there] += 1
+    most = {key: counts.most_common(1)[0][0] for key, counts in leads.items()}
+    for t, action, u in chart.links:
+        if (here := keys[t]) is not None and (likely := most.get((here, action))) is not None and likely[0] == chart.seen[u]:
+            keys[u] = likely
+    return [-1 if key is None else key[1] for key in keys]
+
+
+def _keys(guess: Sequence[int], chart: Chart) -> list[_Key | None]:
+    """What is seen at each node, and its label, where it has one: steps that show different things are not at one dstate."""
+    return [None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)]
+
+
+class Beside:
+    """A search for small maps in a thread of its own: numpy and clingo let go of Python's lock while they work.
+
+    labels  of the last map found, if any
+    bound   of the search, once the search is over
+    """
+
+    def __init__(self, search: NearbySearch, watch: Watch, found: Iterator[Labels]) -> None:
+        self.labels: Labels | None = None
+        self.bound = 0
+        self._watch = watch
+        self._held = [search, found]  # until they are freed
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, args=(search, found), daemon=True)
+        self._thread.start()
+
+    @property
+    def running(self) -> bool:
+        return self._thread.is_alive()
+
+    def check(self) -> None:
+        """Raise what went wrong there."""
+        if self._error is not None:
+            raise self._error
+
+    def end(self) -> None:
+        self._watch.interrupted = True
+        self._thread.join()
+        threading.Thread(target=self._held.clear).start()  # to free clingo's control may take seconds, for which nobody has to wait
+
+    def _run(self, search: NearbySearch, found: Iterator[Labels]) -> None:
+        try:
+            for labels in found:
+                self.labels = labels
+            self.bound = search.bound or 0
+        except LimitError:
+            pass
+        except BaseException as error:
+            self._error = error

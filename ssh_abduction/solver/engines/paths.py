@@ -1,0 +1,263 @@
+"""Questions to paths_framed.lp: what order and sides say of the dstates of a trace whose places have frames, and which guesses they let be maps.
+
+What takes a choice of places and paths is asked by an engine, under its limits (`engines/framed.py`). What is asked here takes none, or
+hardly any: so little time that some conflicts are limit enough.
+
+*A guess.* Visits are annealed (`guesses/annealing.py`). Where the guess cannot be right its places are let free, and what is there is
+merged by evidence (`guesses/merging.py`), while paths_framed.lp says which visits cannot be one, and which have to be, and which merge leads to
+no paths: so a guess becomes a map.
+
+*Taken back.* Where what is known by then has no paths, the first merge that shows it is found by bisection, and the two classes that it
+made one are apart from then on. Where the guess itself has no paths, its places are taken in order, those visited once first and then
+those visited most; the first place with which there are no paths is left out of the guess, a few at most. Where a guess leads to no map,
+another one follows, with more spare names for places: places that fall together where names are short do not come apart later.
+
+*Separate paths.* To see that dstates have paths at all, no two places that turns do not join, and no two segments of a path, are taken
+for one unless they have to be. That takes a small part of the time that it takes to ground all ways to merge them.
+
+*Pinned.* For the fewest paths, segments no two of which can be one path are paths of their own, and the other segments choose among these
+first.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import clingo
+import numpy as np
+
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.control import Control
+from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.solver.guesses.annealing import MORE, SECONDS, attempts
+from ssh_abduction.solver.guesses.merging import Told, first_failing, kept, merged_as_told, merged_near
+from ssh_abduction.solver.steps.apart import Matrix, large_clique
+from ssh_abduction.solver.steps.chart import FramedChart
+from ssh_abduction.solver.steps.localising import faced, states_of, tracked
+from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.theory import Theory
+
+# So clasp lists the answers in which no atom that is shown can be spared.
+SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
+# Of a trace that has more than twice as many pairs of visits that may be one, the beginning with so many is guessed first: annealing takes time for each pair.
+FIRST_PAIRS = 200_000
+# A guess at the beginning says where the visits of the whole trace are if it leaves this share of them open at most. With more it is worth little.
+LOST = 0.05
+# After so many conflicts it is left open whether there are separate paths: the question is asked thousands of times, and mostly decided without a conflict.
+TRYING = 500
+# So many places, at most, are left out of a guess so that the others have paths. A guess that is wrong about more is better made anew.
+LEFT_OUT = 3
+# So many times the time, and the memory, that grounding places and paths took clasp takes before it can be stopped, about.
+PREPARING = (1.6, 2.1)
+# Where a guess cannot be right, the places less than so many travels away are let free, too, as a wrong place mostly has a wrong neighbour.
+LOOSENED = 2
+
+
+class Paths:
+    """The axioms of places and paths, for charts of one trace.
+
+    pinned     whether segments no two of which can be one path are named as paths beforehand
+    check      called now and then while clingo grounds; may raise. A process that is sent these questions has its own, so this does not go along
+    forbidden  sets of equalities of steps that do not all hold, as evidence found out
+    """
+
+    def __init__(
+        self,
+        trace: Trace,
+        theory: Theory,
+        *,
+        pinned: bool = True,
+        check: Callable[[], None] = lambda: None,
+        forbidden: Sequence[Collection[Equality]] = (),
+    ) -> None:
+        self._trace = trace
+        self._theory = theory
+        self._pinned = pinned
+        self._forbidden = forbidden
+        self._check = check
+
+    def __reduce__(self) -> tuple[Callable[..., Paths], tuple[Trace, Theory]]:
+        return partial(Paths, pinned=self._pinned, forbidden=self._forbidden), (self._trace, self._theory)
+
+    def _under(self, check: Callable[[], None]) -> Paths:
+        """The same questions, which these limits end."""
+        return Paths(self._trace, self._theory, pinned=self._pinned, check=check, forbidden=self._forbidden)
+
+    def control(self, chart: FramedChart, options: Sequence[str] = ()) -> Control:
+        """A control with these axioms, and what happened; nothing is grounded yet."""
+        control = Control(options, self._check, PREPARING)
+        control.load_encodings("paths_framed")
+        control.add("base", [], facts.paths_framed_facts(self._trace, self._theory, chart, self._forbidden))
+        return control
+
+    def contrary(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:
+        """A control that says which single paths these labels contradict."""
+        control = self.control(chart)
+        control.add("base", [], facts.settled_labels(enumerate(labels)))
+        control.ground([("base", []), ("again", []), ("contrary", [])])
+        return control
+
+    def clashing(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:
+        """A control whose answers are the minimal sets of nodes whose labels no paths fit, as far as that takes no choice of paths."""
+        control = self.control(chart, SMALLEST)
+        control.add("base", [], facts.open_labels(labels))
+        control.ground([("base", [])])
+        return control
+
+    def settled(
+        self, chart: FramedChart, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None, *, single: bool
+    ) -> clingo.Control:
+        """A control for the paths that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
+        control = self.control(chart, options)
+        control.load_encodings("preference")
+        nodes = range(len(labels)) if nodes is None else nodes
+        control.add("base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single))
+        control.ground([("base", []), *([("again", [])] if single else []), ("segments", []), ("least", [])])
+        if self._pinned and not single:
+            control.add("pinned", [], facts.pinned_facts(pairwise_distinct(*facts.read_rivals(control))))
+        control.ground([("pinned", []), ("paths", []), ("each", [])])
+        return control
+
+    def telling(self, chart: FramedChart, labels: Sequence[int], loose: Iterable[int]) -> clingo.Control:
+        """A control for what holds wherever the nodes are at these dstates, though loose ones may turn out to be others."""
+        control = self.control(chart)
+        control.add("base", [], f"{facts.settled_labels(enumerate(labels))}\n{facts.loose(loose)}")
+        control.ground([("base", []), ("again", []), ("apart", [])])
+        return control
+
+    def told(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
+        """Which nodes are apart, and which are one, where these labels hold of all nodes but some; None where that cannot be."""
+        control = self.telling(chart, labels, {labels[node] for node in loose})
+        with control.solve(yield_=True) as handle:
+            model = handle.model()
+            assert model
+            violated, elsewhere, one = facts.read_told(model)
+        if violated:
+            return None
+        first = {label: node for node, label in reversed(list(enumerate(labels)))}
+        return _apart(chart, labels, elsewhere), [(first[a], first[b]) for a, b in one]
+
+    def may_fit(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
+        """Whether these labels, which hold of all nodes but some, may be those of a map, as far as separate paths tell."""
+        control = self.control(chart)
+        control.add("base", [], facts.settled_labels(enumerate(labels)))
+        control.ground([("base", [])])
+        return not facts.is_violated(control) and self._may_have_separate(chart, labels, loose)
+
+    def has_separate(self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None) -> bool | None:
+        """Whether the labels of all nodes, or of these, have paths, as far as separate ones tell. None where that is not soon known."""
+        options = [f"--solve-limit={TRYING}"]
+        return self.settled(chart, labels, options, nodes, single=True).solve().satisfiable
+
+    def _may_have_separate(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
+        return self.has_separate(chart, labels, set(range(len(labels))).difference(loose)) is not False
+
+    def guessed_labels(self, chart: FramedChart, watch: Watch) -> list[int]:
+        """Labels of a map of the causal axioms: one that has paths, as far as separate ones tell, or where that is not soon found one of few dstates.
+
+        Of a long trace the beginning is guessed, and the rest as that says; where that is no map, twice as many visits, and so on.
+        """
+        asked = self._under(watch.check)
+        visits = chart.visits_with(FIRST_PAIRS)
+        while visits < len(chart.stars) and chart.fitting[-1] > 2 * chart.fitting[visits]:
+            part = chart.beginning(visits)
+            if labels := asked._continued(chart, part, asked._guessed(part, watch.check), watch.check):
+                return labels
+            visits *= 2
+        return asked._guessed(chart, watch.check)
+
+    def _guessed(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
+        """The same, of visits that are guessed in one go."""
+        began = time.thread_time()  # a thread may be made to wait
+        apart = chart.apart()
+        found: list[list[int]] = []
+        for _, guess in attempts(replace(chart, elsewhere=chart.away), check):
+            starts = [guess.loosened(chart, travels).labels(chart) for travels in range(LOOSENED)]
+            maps = [(merged_near(apart, chart.links, start, check), start) for start in starts]
+            ranked = sorted(maps, key=lambda pair: len(set(pair[0])))
+            for _, start in ranked:
+                if labels := self.labels_near(chart, apart, start, check):
+                    return labels
+            found.append(ranked[0][0])
+            if len(found) >= len(MORE) and time.thread_time() - began > SECONDS:
+                return min(found, key=lambda labels: len(set(labels)))
+        raise AssertionError
+
+    def _continued(self, chart: FramedChart, part: FramedChart, known: Sequence[int], check: Callable[[], None]) -> list[int] | None:
+        """Such labels of all visits near those of a beginning, if these say where most visits are."""
+        states = tracked(chart, dict(enumerate(states_of(part, known))))
+        if states.count(-1) > LOST * len(states):
+            return None
+        start = [faced(states[visit], slot) if states[visit] >= 0 else -1 for visit, slot in chart.facing]
+        return self.labels_near(chart, chart.apart(), start, check)
+
+    def labels_near(
+        self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None] = lambda: None
+    ) -> list[int] | None:
+        """Labels near these, which are -1 where they are not known, of a map that has paths, as far as separate ones tell; None if none is soon found.
+
+        apart  which nodes are apart, nodes x nodes
+        check  called now and then; may raise
+        """
+        tell = partial(self._told_if_separate, chart)
+        likely = self._likely(chart, apart, start, check)
+        labels = merged_as_told(apart, chart.links, likely, tell, partial(self.may_fit, chart), check) if likely else None
+        return labels if labels and self.has_separate(chart, labels) else None
+
+    def _told_if_separate(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
+        """As `told`; None where the others have no paths either, as far as separate ones tell."""
+        told = self.told(chart, labels, loose)
+        return told if told and self._may_have_separate(chart, labels, loose) else None
+
+    def _likely(self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]) -> list[int] | None:
+        """A guess without those of its places with which it has no paths, if they are few: -1 there."""
+        states = states_of(chart, kept(apart, chart.links, start))
+        visits = Counter(state // 4 for state in states)
+        # What was visited once cannot be wrong by itself, and hardly what was visited often.
+        places = sorted(visits, key=lambda place: (visits[place] > 1, -visits[place]))
+        left_out: set[int] = set()
+
+        def of_first(number: int) -> list[int]:
+            some = set(places[:number]) - left_out
+            return [label if states[visit] // 4 in some else -1 for label, (visit, _) in zip(start, chart.facing, strict=True)]
+
+        def agrees(number: int) -> bool:
+            check()
+            labels = of_first(number)
+            loose = [node for node, label in enumerate(labels) if label < 0]
+            return self.may_fit(chart, kept(apart, chart.links, labels), loose)
+
+        right = 0
+        while not agrees(len(places)):
+            if right == len(places) or len(left_out) == LEFT_OUT:
+                return None
+            right = first_failing(agrees, right + 1, len(places))
+            left_out.add(places[right - 1])
+        return of_first(len(places))
+
+
+def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
+    """As many members as are soon found no two of which can be one, as these pairs cannot. They are segments, or places."""
+    number = {member: i for i, member in enumerate(members)}
+    rivals = np.zeros((len(members), len(members)), dtype=bool)
+    for g, h in pairs:
+        rivals[number[g], number[h]] = True
+    return [members[i] for i in large_clique(rivals)]
+
+
+def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:
+    """Nodes x nodes: they are of visits some nodes of which have labels that are at different places."""
+    pairs = np.array(list(elsewhere), dtype=int).reshape(-1, 2)
+    different = np.zeros((max(labels) + 1,) * 2, dtype=bool)
+    different[pairs[:, 0], pairs[:, 1]] = different[pairs[:, 1], pairs[:, 0]] = True
+    visits = np.array([visit for visit, _ in chart.facing])  # in order, as nodes are numbered by the first step at them
+    starts = np.flatnonzero(np.diff(visits, prepend=-1))
+    rows = np.logical_or.reduceat(different[list(labels)], starts, axis=0)
+    apart = np.logical_or.reduceat(rows[:, list(labels)], starts, axis=1)
+    nodes: Matrix = apart[np.ix_(visits, visits)]
+    return nodes

@@ -1,0 +1,67 @@
+"""What order and sides demand of visits that are one, where places have frames: said only of the paths that an answer contradicts.
+
+To say it of a path takes a rule for each two visits that may be one. In a world half explored the causal axioms allow fewer dstates than order and
+sides do, in thousands of ways, and to forbid these one by one does not end; but few paths show nearly all of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.engines.paths import Paths
+from ssh_abduction.solver.steps.chart import FramedChart
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.theory import Theory
+
+
+class FramedSides:
+    """The axioms of order and sides, path by path, in the control that knows visits."""
+
+    def __init__(self, theory: Theory, asker: Asker) -> None:
+        self._theory, self._asker = theory, asker
+        self.begin()
+
+    def begin(self) -> None:
+        """The control is a new one, which knows nothing."""
+        self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # program parts of sides_framed.lp, and their arguments
+        self._batch = -1
+
+    def extend(self, batch: int) -> None:
+        """Clingo was told of more visits, in this batch: what was said of paths is said of these, too."""
+        self._batch = batch
+        if self._said:
+            paths = [(part, facts.numbers(*arguments, batch)) for part, arguments in self._said if part == "path"]
+            self._asker.control.ground([("paths", facts.numbers(batch)), *paths])
+
+    def say_of_path(self, paths: Paths, chart: FramedChart, labels: Sequence[int], standing: Mapping[int, tuple[int, int]]) -> bool:
+        """Say what order and sides demand of a path that these labels contradict. False if all such paths have been told of.
+
+        standing  the visit and slot of some node at each dstate, as far as clingo knows of any
+        """
+        contrary, twice = next(self._asker.answers(facts.read_contrary, "ignore", 1, control=paths.contrary(chart, labels)))
+        if any(self._say_once("path", *standing[dstate]) for dstate in contrary):
+            return True
+        for visit in (standing[dstate][0] for dstate in twice):
+            said = [self._say_once("path", visit, 0), self._say_once("path", visit, 1), self._say_once("crossing", visit, self._batch)]
+            if any(said):
+                return True
+        return False
+
+    def _say_once(self, part: str, *arguments: int) -> bool:
+        """Ground a part of sides_framed.lp, unless it was before. Returns whether it was not."""
+        if (part, arguments) in self._said:
+            return False
+        control, batches = self._asker.control, range(self._batch + 1)
+        with self._asker.grounding_timed():
+            if not self._said:
+                control.load(encodings.path("sides_framed"))
+                control.add("sides", [], facts.sides_framed_facts(self._theory))
+                control.ground([("sides", []), *(("paths", facts.numbers(batch)) for batch in batches)])
+            self._said[part, arguments] = None
+            if part == "path":
+                control.ground([(part, facts.numbers(*arguments, batch)) for batch in batches])
+            else:
+                control.ground([(part, facts.numbers(*arguments))])
+        return True

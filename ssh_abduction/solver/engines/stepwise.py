@@ -1,0 +1,167 @@
+"""The engine that grounds the readable encodings, step by step: every theory can be asked of it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from typing import Any
+
+import clingo
+
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.engines.base import Found, Task
+from ssh_abduction.solver.engines.doubts import Doubt, Doubts
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.theory import Count
+
+# A prefix grows by this factor at least, so that there are few of them.
+GROWTH = 1.25
+# So many steps are grounded in one call until the prefix has FIRST_STEPS: for a short prefix the call costs more than the steps.
+AT_FIRST, FIRST_STEPS = 8, 32
+
+
+class StepEngine:
+    """The encodings of all levels: a dstate is named by the first step at it."""
+
+    lists_least = False
+    goes_on = True
+
+    def __init__(self, task: Task, paths: int) -> None:
+        self.asker = Asker(task.watch)
+        self.bound: int | None = None
+        self.intact = True
+        self.size = 0
+        self.paths = paths
+        self._task = task
+        self._asked: int | None = None  # the step that is the last one, as far as clingo knows
+        self._forbidden: list[Collection[Equality]] = []
+        self._number: tuple[int, Count] | None = None  # how many dstates, places or paths maps have, where somebody asked for just so many
+        # Seconds and MiB that it took to ground the last step: the next one takes about as much, and cannot be stopped.
+        self._last_step = 0.0, 0.0
+        control = self.asker.control
+        self._doubts = Doubts(self.asker, control, facts.steps_are_one)
+        for name in facts.encoding_names(task.theory):
+            control.load(encodings.path(name))
+        control.add("base", [], facts.theory_facts(task.theory, paths))
+        control.add("base", [], facts.own_rules(task.theory))
+
+    def with_paths(self, paths: int) -> StepEngine:
+        engine = StepEngine(self._task, paths)
+        engine.asker.ground_seconds, engine.asker.solve_seconds = self.asker.ground_seconds, self.asker.solve_seconds
+        engine._forbidden, engine._number = list(self._forbidden), self._number
+        return engine
+
+    def over(self, task: Task) -> StepEngine:
+        self._task, self.asker.watch = task, task.watch
+        self.asker.ground_seconds = self.asker.solve_seconds = 0.0
+        return self
+
+    def next_size(self, failed: int) -> int:
+        return min(len(self._task.trace), max(failed + 1, int(self.size * GROWTH)))
+
+    @property
+    def size_to_go_on(self) -> int:
+        return self.size
+
+    def grow(self, size: int) -> None:
+        is_new = not self.size
+        with self.asker.grounding_timed():
+            while self.size < size:
+                self._ground_steps(min(size, self.size + (AT_FIRST if self.size < FIRST_STEPS else 1)))
+            self._let_end_with(size - 1)
+            if is_new:
+                for number in range(len(self._forbidden)):
+                    self._tell_forbidden(number)
+                self._tell_number()
+
+    def _ground_steps(self, stop: int) -> None:
+        """Ground the steps up to this one."""
+        self.asker.watch.check(*self._last_step)
+        control, start = self.asker.control, self.size
+        part = f"steps_from_{start}"
+        control.add(part, [], facts.trace_facts(self._task.trace, self._task.theory, start, stop))
+        before = control.seconds, control.mebibytes
+        base: list[tuple[str, list[clingo.Symbol]]] = [] if start else [("base", [])]
+        control.ground([*base, (part, []), *(("step", facts.numbers(t)) for t in range(start, stop))])
+        if base:
+            control.assign_external(facts.run_by_steps(), True)
+        self._last_step = control.seconds - before[0], control.mebibytes - before[1]
+        self.size = stop
+
+    def _let_end_with(self, last: int) -> None:
+        """Let clingo take this step for the last one."""
+        if self._asked == last:
+            return
+        control = self.asker.control
+        control.ground([("check", facts.numbers(last))])
+        if self._asked is not None:
+            control.release_external(facts.query(self._asked))
+        control.assign_external(facts.query(last), True)
+        self._asked = last
+
+    def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
+        if most:
+            configuration: Any = self.asker.control.configuration
+            configuration.solver.opt_strategy = "usc"  # as a good map is known, what is missing is a bound
+        if self._task.theory.priorities:
+            return self.asker.answers(self._read, ",".join(["opt", *map(str, most)]), 0)
+        return self.asker.answers(self._read, "ignore", 1)
+
+    def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
+        bound = ",".join(map(str, cost))
+        return self.asker.answers(self._read, f"enum,{bound}" if bound else "ignore", 0)
+
+    def map_with(self, doubts: Collection[Doubt], cost: tuple[int, ...]) -> SSHMap | None:
+        """A map of the prefix that costs at most this, in which any of these doubts about steps holds; None where there is none."""
+        found = self._doubts.answer(doubts, self._read, f"enum,{','.join(map(str, cost))}" if cost else "ignore")
+        return None if found is None else found.map
+
+    def labellings(self, cost: tuple[int, ...]) -> None:
+        """Dstates are not settled before places and paths."""
+
+    def forbid(self, equalities: Collection[Equality]) -> bool:
+        self._forbidden.append(equalities)
+        self._tell_forbidden(len(self._forbidden) - 1)
+        return True
+
+    def ask_for(self, number: int, count: Count) -> None:
+        """From now on maps have just so many dstates, places or paths, and the prefix does not grow any more."""
+        if self._number is not None:
+            self.asker.control.release_external(facts.of_number(*self._number))
+        self._number = number, count
+        self._tell_number()
+
+    def _tell_number(self) -> None:
+        if self._number is None:
+            return
+        part = f"number_{self._number[0]}"
+        self.asker.control.add(part, [], facts.exactly(*self._number))
+        self.asker.control.ground([(part, [])])
+        self.asker.control.assign_external(facts.of_number(*self._number), True)
+
+    def settle(self) -> None:
+        """Nothing goes on in clingo beyond an answer."""
+
+    def _tell_forbidden(self, number: int) -> None:
+        part = f"forbidden_{number}"
+        self.asker.control.add(part, [], facts.forbidden_equalities(self._forbidden[number], excusable=self._task.theory.jumped > 0))
+        self.asker.control.ground([(part, [])])
+
+    def _read(self, model: clingo.Model) -> Found:
+        return Found(facts.read_map(model, self._task.trace, self._task.theory), tuple(model.cost))
+
+
+def paths_needed(task: Task, size: int, cost: tuple[int, ...] | None) -> int:
+    """How many names for paths it takes to be sure that no map of the prefix has another cost, or is missed at this one."""
+    theory = task.theory
+    segments = facts.most_paths(task.trace, theory, size)
+    first = theory.priorities[0] if theory.priorities else None
+    if theory.level == "causal":
+        return 0
+    if cost is None or not task.speedups.path_names or first not in ("paths", "dstates"):
+        return segments
+    if first == "paths":
+        return cost[0]
+    return min(segments, cost[0] // (1 if "course_needs_travel" in theory.given_up else 2))

@@ -1,0 +1,304 @@
+"""How well a map closes: the poses of its dstates that agree best with the displacements of the trace.
+
+>>> from ssh_abduction import Theory, Trace, solve
+>>> from ssh_abduction.solver.fit import fit
+>>> square = [(10, 0, 0), (0, 0, 1.5708)] * 4
+>>> trace = Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=square)
+>>> ssh_map = solve(trace, Theory.causal()).maps[0]
+>>> found = fit(trace, ssh_map)
+>>> len(found.poses) == len(ssh_map.dstates)
+True
+
+Unknown are the position of each place (of each dstate, where the map has no places), the heading of each dstate, and what is wrong with all displacements: their
+scale, and a steady drift of heading, which have a prior. Each displacement of the trace, divided by its standard deviations, says what they should be. The best poses are
+those with the least sum of squares (Lu & Milios 1997, "Globally consistent range scan alignment"). That sum is chi-square distributed if the map is true and the
+odometry is as good as it says. It ranks maps that are equally minimal, and warns; it refuses none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.linalg import lsqr, splu
+from scipy.special import gammaincc
+
+from ssh_abduction.data.clock import look_at_clock
+from ssh_abduction.data.maps import Fit, Pose, SSHMap
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.theory.evidence.loops import turned
+
+Array: TypeAlias = NDArray[np.float64]
+
+# With a standard deviation below this, in metres or radians, a displacement counts as exact.
+EXACT = 2e-3
+# The power method takes so many sweeps, and holds each rotation with so much weight to where it was: little, as a metre is worth some hundreds.
+SWEEPS, HELD = 20, 1e-2
+
+
+def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
+    """The poses of the dstates of a map that agree best with the displacements, and how well they do.
+
+    trace    with displacements on some of its steps
+    ssh_map  a map of all of its steps
+    """
+    return _Problem(trace, ssh_map).solved()
+
+
+class _Problem:
+    """Least squares over the places and headings of one map.
+
+    The unknowns are x and y of each position, then the heading of each dstate, then the scale and the drift, as multiples of their standard deviations.
+    """
+
+    def __init__(self, trace: Trace, ssh_map: SSHMap) -> None:
+        odometry = trace.odometry or Odometry()
+        steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
+        labels = np.asarray(ssh_map.labels, dtype=int)
+        self._of_step = np.asarray(steps, dtype=int)
+        self._from, self._to = labels[self._of_step - 1], labels[self._of_step]
+        self._moved = np.array([trace.steps[t].displacement for t in steps], dtype=float).reshape(-1, 3)
+        noise = np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
+        # Each dstate has one pose here, so how far off it is taken to be at a visit counts as an error of the displacements to it and from it.
+        travelled = np.array([trace.actions[t - 1].kind != "turn" for t in steps], dtype=float).reshape(-1, 1, 1)
+        noise = noise + travelled * 2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
+        self._whitening = np.linalg.inv(np.linalg.cholesky(noise)) if steps else noise
+        self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
+        self._sigma = np.array([odometry.scale, odometry.bend])
+        places = [s.place if s.place is not None else -1 - s.id for s in ssh_map.dstates]
+        number = {place: i for i, place in enumerate(dict.fromkeys(places))}
+        self._place = np.array([number[place] for place in places], dtype=int)
+        self._positions, self._headings = len(number), len(places)
+        self._size = 2 * self._positions + self._headings + 2
+        # The group of each dstate: displacements connect the headings of one group, and of one part of the map the positions.
+        self._group = connected_components(self._graph(self._from, self._to, self._headings), directed=False)[1]
+
+    def solved(self) -> Fit:
+        unknown = self._begun()
+        if len(self._moved):
+            found = least_squares(self._residuals, unknown, self._jacobian, method="trf", tr_solver="lsmr", x_scale="jac", max_nfev=50)
+            unknown = found.x
+        squares = float((self._residuals(unknown) ** 2).sum())
+        freedom = self._freedom(unknown)
+        p = float(gammaincc(freedom / 2, squares / 2)) if freedom > 0 else 1.0
+        scale, bend = (float(x) for x in unknown[-2:] * self._sigma)
+        return Fit(squares, freedom, p, scale, bend, self._poses(unknown))
+
+    def _begun(self) -> Array:
+        """Unknowns to begin with."""
+        unknown = np.zeros(self._size)
+        at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
+        # Headings first, which are linear but for whole turns, and then positions, which are linear where headings are known (Carlone et al. 2014).
+        reckoned = self._reckoned()
+        off = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
+        off -= math.tau * np.round(off / math.tau)
+        heading[:] = reckoned + _least(self._differences(self._from, self._to, self._headings), off / self._sigmas(2), 1 / self._sigmas(2))
+        weights, differences = 1 / self._sigmas(0), self._moves()
+        if self._group.max() > 0:
+            heading += self._rotations(turned(self._moved[:, :2], heading[self._from]))[self._group]
+        onward = turned(self._moved[:, :2], heading[self._from])
+        for axis in range(2):
+            at[:, axis] = _least(differences, onward[:, axis] * weights, weights)
+        return unknown
+
+    def _reckoned(self) -> Array:
+        """For each dstate, the heading as seen from one of its group, by the fewest displacements between."""
+        heading = np.zeros(self._headings)
+        rotated: dict[tuple[int, int], float] = {}
+        for s, x, angle in zip(self._from.tolist(), self._to.tolist(), self._moved[:, 2].tolist(), strict=True):
+            rotated[x, s], rotated[s, x] = -angle, angle
+        graph = self._graph(self._from, self._to, self._headings)
+        for first in np.unique(self._group, return_index=True)[1].tolist():
+            order, before = breadth_first_order(graph, first, directed=False)
+            for x, s in zip(order[1:].tolist(), before[order[1:]].tolist(), strict=True):
+                heading[x] = heading[s] + rotated[s, x]
+        return heading
+
+    def _rotations(self, onward: Array) -> Array:
+        """By how much the headings of each group are to be turned, in radians, so that positions agree.
+
+        What is least is a quadratic form of the rotations, as complex numbers on the unit circle. They are sought by the power method for its inverse, from
+        anywhere (Boumal 2016, "Nonconvex phase synchronization"). What positions do not tell stays as it begins.
+
+        onward  the displacements, as headings are now
+        """
+        size = int(self._group.max()) + 1
+        inverse = np.linalg.inv(self._misfit(onward) + HELD * np.identity(size))
+        rotation: NDArray[np.complex128] = np.exp(1j * np.random.default_rng(0).uniform(-math.pi, math.pi, size))
+        for _ in range(SWEEPS):
+            look_at_clock()
+            rotation = inverse @ rotation
+            rotation /= np.maximum(abs(rotation), 1e-300)
+        angles: Array = np.angle(rotation)
+        return angles
+
+    def _misfit(self, onward: Array) -> NDArray[np.complex128]:
+        """The least sum of squares that positions can come to, as a quadratic form of the rotation of each group; vectors are complex numbers.
+
+        onward  the displacements, as headings are without these rotations
+        """
+        weights = 1 / self._sigmas(0)
+        vectors = weights * (onward[:, 0] + 1j * onward[:, 1])
+        columns = np.arange(len(vectors)), self._group[self._from]
+        turns = coo_array((vectors, columns), shape=(len(vectors), int(self._group.max()) + 1)).tocsr()
+        moves = csr_array(self._moves().multiply(weights[:, None]))
+        mixed = (moves.T @ turns).toarray()
+        solved = splu(((moves.T @ moves) + 1e-9 * _identity(self._positions)).tocsc().astype(complex)).solve(mixed)
+        form: NDArray[np.complex128] = (turns.conj().T @ turns).toarray() - mixed.conj().T @ solved
+        return form
+
+    def _moves(self) -> csr_array:
+        """The matrix that makes, of positions, how far each displacement leads."""
+        return self._differences(self._place[self._from], self._place[self._to], self._positions)
+
+    def _graph(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
+        return coo_array((np.ones(len(first)), (first, second)), shape=(size, size)).tocsr()
+
+    def _sigmas(self, axis: int) -> Array:
+        """The standard deviation of each displacement along an axis, about."""
+        sigmas: Array = 1 / np.sqrt((self._whitening[:, :, axis] ** 2).sum(1))
+        return sigmas
+
+    def _differences(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
+        """The matrix that makes, of values, their differences: second minus first."""
+        rows = np.arange(len(first))
+        ones = np.ones(len(first))
+        entries = np.concatenate([ones, -ones]), (np.concatenate([rows, rows]), np.concatenate([second, first]))
+        return coo_array(entries, shape=(len(first), size)).tocsr()
+
+    def _predicted(self, unknown: Array) -> tuple[Array, Array, Array]:
+        """What each displacement should be, and the cosine and sine of the heading in its middle."""
+        at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
+        scale, bend = unknown[-2:] * self._sigma
+        gone = at[self._place[self._to]] - at[self._place[self._from]]
+        facing = heading[self._from] - bend * self._way / 2
+        cos, sin = np.cos(facing), np.sin(facing)
+        ahead, left = cos * gone[:, 0] + sin * gone[:, 1], cos * gone[:, 1] - sin * gone[:, 0]
+        rotated = heading[self._to] - heading[self._from] + bend * self._way
+        return np.stack([(1 + scale) * ahead, (1 + scale) * left, rotated], axis=1), cos, sin
+
+    def _residuals(self, unknown: Array) -> Array:
+        look_at_clock()
+        predicted = self._predicted(unknown)[0]
+        off = predicted - self._moved
+        off[:, 2] -= math.tau * np.round(off[:, 2] / math.tau)
+        return np.concatenate([np.einsum("nij,nj->ni", self._whitening, off).ravel(), unknown[-2:]])
+
+    def _jacobian(self, unknown: Array) -> csr_array:
+        predicted, cos, sin = self._predicted(unknown)
+        scale = 1 + unknown[-2] * self._sigma[0]
+        m, heading = len(self._moved), 2 * self._positions
+        zero, one = np.zeros(m), np.ones(m)
+        ahead, left = predicted[:, 0], predicted[:, 1]
+        by_x, by_y = np.stack([scale * cos, -scale * sin, zero], 1), np.stack([scale * sin, scale * cos, zero], 1)
+        by_facing = np.stack([left, -ahead, zero], 1)
+        columns = [
+            (2 * self._place[self._to], by_x),
+            (2 * self._place[self._to] + 1, by_y),
+            (2 * self._place[self._from], -by_x),
+            (2 * self._place[self._from] + 1, -by_y),
+            (heading + self._from, by_facing - np.stack([zero, zero, one], 1)),
+            (heading + self._to, np.stack([zero, zero, one], 1)),
+            (np.full(m, self._size - 2), np.stack([ahead, left, zero], 1) * (self._sigma[0] / scale)),
+            (np.full(m, self._size - 1), (-by_facing / 2 + np.stack([zero, zero, one], 1)) * self._way[:, None] * self._sigma[1]),
+        ]
+        rows = np.arange(3 * m)
+        values = [np.einsum("nij,nj->ni", self._whitening, derivative).ravel() for _, derivative in columns]
+        priors = np.arange(2)
+        entries = (
+            np.concatenate([*values, np.ones(2)]),
+            (
+                np.concatenate([np.tile(rows, len(columns)), 3 * m + priors]),
+                np.concatenate([*(np.repeat(column, 3) for column, _ in columns), self._size - 2 + priors]),
+            ),
+        )
+        return coo_array(entries, shape=(3 * m + 2, self._size)).tocsr()
+
+    def _parts(self) -> NDArray[np.int_]:
+        """The part of the map that each position is in: displacements do not connect one part with another."""
+        part: NDArray[np.int_] = connected_components(
+            self._graph(self._place[self._from], self._place[self._to], self._positions), directed=False
+        )[1]
+        return part
+
+    def _freedom(self, unknown: Array) -> int:
+        """The degrees of freedom: what displacements say, without what the poses take up. Each part of the map may be moved as a whole, and turned, as may each group of
+        headings in it that positions leave open.
+
+        What is known to the millimetre has no noise that would count: it settles as many unknowns as it is about, and says no more.
+        """
+        said = np.unique(np.concatenate([self._from, self._to]))
+        used = np.unique(self._place[said])
+        parts = len(np.unique(self._parts()[used]))
+        exact = (1 / np.sqrt((self._whitening**2).sum(1)) < EXACT).ravel()
+        settled = int(np.linalg.matrix_rank(self._jacobian(unknown)[: len(exact)][exact].toarray())) if exact.any() else 0
+        return int(len(exact) - exact.sum() - (2 * len(used) + len(said) - 2 * parts - self._open_rotations(unknown, said) - settled))
+
+    def _open_rotations(self, unknown: Array, said: NDArray[np.int_]) -> int:
+        """In how many ways groups of headings can be turned while all displacements stay what they are.
+
+        said  the dstates that displacements are about
+        """
+        groups = np.unique(self._group[said])
+        if len(groups) == len(np.unique(self._parts()[self._place[said]])):
+            return len(groups)
+        at = unknown[: 2 * self._positions].reshape(-1, 2)
+        form = self._misfit(at[self._place[self._to]] - at[self._place[self._from]]).real[groups][:, groups]
+        return int((np.linalg.eigvalsh(form) < 1e-6 * max(float(form.diagonal().max()), 1.0)).sum())
+
+    def _poses(self, unknown: Array) -> tuple[Pose, ...]:
+        """The poses, each part of the map seen from the first dstate there; and how uncertain the positions are as seen from it."""
+        at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
+        part = self._parts()
+        first = {int(part[self._place[s]]): s for s in range(self._headings - 1, -1, -1)}
+        poses: list[Pose] = []
+        spreads = self._spreads(unknown, list(first.values()))
+        for s in range(self._headings):
+            origin = first[int(part[self._place[s]])]
+            dx, dy = at[self._place[s]] - at[self._place[origin]]
+            cos, sin = math.cos(heading[origin]), math.sin(heading[origin])
+            facing = math.remainder(float(heading[s] - heading[origin]), math.tau)
+            back = np.array([[cos, sin], [-sin, cos]])
+            (xx, xy), (_, yy) = back @ spreads[s] @ back.T
+            poses.append(Pose(float(cos * dx + sin * dy), float(cos * dy - sin * dx), facing, (float(xx), float(xy), float(yy))))
+        return tuple(poses)
+
+    def _spreads(self, unknown: Array, origins: Sequence[int]) -> Array:
+        """The covariance of the position of each dstate, m x 2 x 2, in square metres, where the poses of the origins are known."""
+        jacobian = self._jacobian(unknown)
+        fixed = [k for s in origins for k in (2 * self._place[s], 2 * self._place[s] + 1, 2 * self._positions + s)]
+        free = np.setdiff1d(np.arange(self._size), fixed)
+        information: Any = (jacobian.T @ jacobian)[free][:, free]
+        information = (information + 1e-12 * _identity(len(free))).tocsc()
+        solver = splu(information)
+        number = {int(k): i for i, k in enumerate(free)}
+        covariance = np.zeros((self._positions, 2, 2))
+        for place in range(self._positions):
+            look_at_clock()
+            if 2 * place not in number:
+                continue
+            columns = np.zeros((len(free), 2))
+            rows = [number[2 * place], number[2 * place + 1]]
+            columns[rows, [0, 1]] = 1.0
+            covariance[place] = solver.solve(columns)[rows]
+        spreads: Array = covariance[self._place]
+        return spreads
+
+
+def _identity(size: int) -> csr_array:
+    numbers = np.arange(size)
+    return coo_array((np.ones(size), (numbers, numbers)), shape=(size, size)).tocsr()
+
+
+def _least(differences: csr_array, values: Array, weights: Array) -> Array:
+    """Values whose differences come nearest to these, which are weighted already."""
+    weighted = csr_array(differences.multiply(weights[:, None]))
+    solved: Array = lsqr(weighted, values, atol=1e-10, btol=1e-10, iter_lim=4 * differences.shape[1] + 100)[0]
+    return solved

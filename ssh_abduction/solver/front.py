@@ -1,0 +1,126 @@
+"""The front of faults: the fewest dstates that explain a trace, for each number of faults.
+
+Without faults the causal theory always has a map, however wrong the trace is, and with many faults a map of few dstates: what is true is where the number of dstates stops
+falling fast, the *knee*. One number that counts both hides it.
+
+>>> from ssh_abduction import Trace
+>>> from ssh_abduction.solver.front import fault_front
+>>> seen = [f"v{t % 4}" if t != 9 else "v0" for t in range(25)]
+>>> front = fault_front(Trace.from_steps(seen, ["right", "travel"] * 12), most=2)
+>>> [point.dstates for point in front.points], front.knee, front.prices
+([13, 4, 4], 1, (0.0, 9.0))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from ssh_abduction.data.errors import TheoryError, brief, is_whole
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
+from ssh_abduction.solver.engines.base import Found, Task
+from ssh_abduction.theory.theory import Theory, checked_theory
+
+# Both kinds of faults are allowed where the theory names none. What they cost plays no part in a front.
+KINDS = {"misread": 1.5, "slipped": 1.5}
+
+
+@dataclass(frozen=True)
+class Point:
+    """What so many faults are worth.
+
+    faults   how many faults a map has, at most
+    dstates  how many dstates a map has then, at least
+    map      a map with so few; None where none was found in time
+    proven   whether there is no map with fewer; without a proof, dstates is a lower bound
+    """
+
+    faults: int
+    dstates: int
+    map: SSHMap | None
+    proven: bool
+
+
+@dataclass(frozen=True)
+class Front:
+    """The points for 0, 1, 2, … faults, as far as time allowed. There is none for numbers of faults that what somebody asserts rules out.
+
+    points   what so many faults are worth
+    stopped  whether the time limit ended the search
+    """
+
+    points: tuple[Point, ...]
+    stopped: bool = False
+
+    @property
+    def knee(self) -> int | None:
+        """The number of faults at which the number of dstates stops falling fast: where it fell most more than it falls next. None where it never does, or where nothing is proven."""
+        counts = self._proven
+        bends = {k: (counts[k - 1] - counts[k]) - (counts[k] - counts[k + 1]) for k in counts if k - 1 in counts and k + 1 in counts}
+        knee = max(bends, key=lambda k: bends[k], default=None)
+        return knee if knee is not None and bends[knee] > 0 else None
+
+    @property
+    def prices(self) -> tuple[float, float] | None:
+        """What a fault must cost, in dstates, for the map at the knee to be minimal among those of the front: more than the first number, and less than the second. None without such a price."""
+        if self.knee is None:
+            return None
+        counts = self._proven
+        here = counts[self.knee]
+        least = max((here - count) / (k - self.knee) for k, count in counts.items() if k > self.knee)
+        most = min((count - here) / (self.knee - k) for k, count in counts.items() if k < self.knee)
+        return (least, most) if least < most else None
+
+    @property
+    def _proven(self) -> dict[int, int]:
+        """The number of dstates for each number of faults for which it is proven."""
+        return {point.faults: point.dstates for point in self.points if point.proven}
+
+
+def fault_front(trace: Trace, theory: Theory | None = None, most: int = 5, limit: float | None = None) -> Front:
+    """The fewest dstates for at most 0, 1, …, `most` faults.
+
+    theory  Theory.causal() by default; its prices say which kinds of faults there are, both where it has none
+    limit   seconds in all
+
+    Raises TheoryError where the theory has places, whose axioms are not known to the engine that counts faults, and where it asserts something of steps that the trace does not have.
+    """
+    theory = Theory.causal() if theory is None else checked_theory(theory)
+    check_limit("limit", "seconds", limit)
+    if theory.jumped:
+        raise TheoryError("jumped: expected no wrong displacements where faults are counted; leave it out (--jumped)")
+    if theory.level != "causal":
+        raise TheoryError("front: expected a causal theory, got a topological one; take Theory.causal() (--theory causal)")
+    if theory.rules or theory.without or theory.prefer not in (("dstates",), ("auto",)):
+        raise TheoryError("front: expected the causal axioms alone, fewest dstates first; leave out --rules, --without and --prefer")
+    if not is_whole(most) or not 0 <= most <= 1000:
+        raise TheoryError(f"front: expected a number of faults from 0 to 1000, got {brief(most)}")
+    theory.check_steps(checked_trace(trace))
+    theory = (theory if theory.has_faults else theory.replace(**KINDS)).resolve(trace)
+    watch = Watch(limit)
+    watch.start()
+    points = tuple(_points(Task.of(trace, theory, watch), most))
+    return Front(points, stopped=any(not point.proven for point in points))
+
+
+def _points(task: Task, most: int) -> Iterator[Point]:
+    from ssh_abduction.solver.engines.faulty import FaultyEngine  # loads numpy
+
+    before: SSHMap | None = None
+    for faults in range(most + 1):
+        engine = FaultyEngine(task, faults)
+        best: Found | None = None
+        try:
+            engine.grow(len(task.trace))
+            for found in engine.improving_maps():
+                best = found
+        except (LimitError, KeyboardInterrupt):
+            yield Point(faults, -(-(engine.bound or 10) // 10), None if best is None else best.map, proven=False)
+            return
+        if best is None:  # what somebody asserts leaves no map with so few faults
+            continue
+        if before is None or len(best.map.dstates) < len(before.dstates):
+            before = best.map  # a map that needs fewer faults is shown again
+        yield Point(faults, len(before.dstates), before, proven=True)

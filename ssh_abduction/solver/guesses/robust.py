@@ -1,0 +1,317 @@
+"""Small maps of the causal theory where some steps may be disbelieved, without a search: nothing proves them.
+
+A hidden Markov model is trained on the trace (Baum, Petrie, Soules, Weiss 1970). Each of its states shows one view, and several show the same (cloned hidden Markov models:
+George et al. 2021), but for a small chance that a view is misread, and that an action slips. From its most probable states a map is read off: a dstate shows what is mostly seen
+there, and an action leads where it mostly leads. What fewest faults that map has on the whole trace, a Viterbi pass tells (Viterbi 1967), which gives other labels; and so on, as long as it
+gets cheaper. In between, dstates are merged that can be one, and dropped where that costs less than they do.
+
+>>> seen = [t % 4 for t in range(60)]
+>>> seen[30] = 0
+>>> explainer = Explainer(seen, [0] * 59, {"misread": [15] * 60})
+>>> guess = next(filter(None, robust_maps(explainer)))
+>>> len(set(guess.labels)), guess.misread, guess.slips, guess.tenths
+(4, (30,), (), 55)
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.solver.guesses.merging import thinned_map
+from ssh_abduction.solver.steps.chart import Link, numbered
+
+CLONES = (
+    4,
+    10,
+    16,
+    10,
+    16,
+    10,
+    16,
+    10,
+)  # So many states each view has, from one start of EM to the next: with more than are needed it finds better optima.
+AGREE = 2  # So many starts that end at the cheapest map known are enough.
+ROUNDS = 100  # Steps of EM from each start, at most.
+ENOUGH = 1e-4  # EM ends where a round gains less than this in log-likelihood, per step of the trace.
+PSEUDOCOUNT = 2e-3  # Added to all counts, as George et al. do.
+MISREAD, SLIPPED = 0.01, 0.01  # The chances that the model is given.
+RARE = 4  # A dstate that is visited so many times at most may be dropped.
+TRIED = 20  # So many of these are tried in a round, and so many pairs of dstates that are nearly one.
+DEARER = (
+    4 / 3
+)  # So many times as much as one that may be, a fault of a kind that may not be costs while a map is refined: few of them can be mended in the end.
+NEVER = 1_000_000  # What the Viterbi pass pays for faults of a kind that may not be.
+UNKNOWN = 0.5  # What it pays, in tenths of dstates, where the map does not know where an action leads: less than any fault.
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Dstates, numbered from 0: the view of each, and where actions lead from it, as far as that is known."""
+
+    shows: Sequence[int]
+    goes: Mapping[tuple[int, int], int]
+
+    @cached_property
+    def actions(self) -> frozenset[int]:
+        return frozenset(action for _, action in self.goes)
+
+    def folded(self, s: int, x: int) -> tuple[int, list[int]]:
+        """What becomes of dstates where two are merged, and all that the same actions lead to from there and show the same; and by how much that contradicts the links,
+        beside what it spares: first those merges are worth a trial for which that is least."""
+        root = list(range(len(self.shows)))
+        members = {dstate: [dstate] for dstate in root}
+        contradicted, merges, work = 0, 0, [(s, x)]
+        while work:
+            a, b = (root[end] for end in work.pop())
+            if a == b:
+                continue
+            if self.shows[a] != self.shows[b]:
+                contradicted += 1
+                continue
+            merges += 1
+            work += [
+                (self.goes[p, action], self.goes[q, action])
+                for action in self.actions
+                for p in members[a]
+                for q in members[b]
+                if (p, action) in self.goes and (q, action) in self.goes
+            ]
+            for dstate in members[b]:
+                root[dstate] = a
+            members[a] += members.pop(b)
+        return contradicted - merges, root
+
+    def without(self, dropped: int) -> Machine:
+        """The machine that lacks a dstate."""
+        number = {s: s - (s > dropped) for s in range(len(self.shows)) if s != dropped}
+        goes = {(number[s], a): number[x] for (s, a), x in self.goes.items() if s in number and x in number}
+        return Machine([view for s, view in enumerate(self.shows) if s != dropped], goes)
+
+
+@dataclass(frozen=True)
+class Explained:
+    """The labels of all steps by a machine, and its faults; the steps at which it does not know where the action leads; and tenths of dstates that it costs."""
+
+    machine: Machine
+    labels: Sequence[int]
+    misread: Sequence[int]
+    slips: Sequence[int]
+    unknown: Sequence[int]
+    tenths: int
+
+    @property
+    def faults(self) -> Sequence[int]:
+        return (*self.misread, *self.slips)
+
+
+@dataclass(frozen=True)
+class Explainer:
+    """A trace as integers, and what faults cost there.
+
+    seen, actions  what is seen at each step, and which action is done there, numbered from 0
+    price          tenths of dstates for each kind of fault that may be (misread, slipped), at each step
+    check          called now and then; may raise
+    """
+
+    seen: Sequence[int]
+    actions: Sequence[int]
+    price: Mapping[str, Sequence[int]]
+    check: Callable[[], None] = field(default=lambda: None)
+
+    def explained(self, machine: Machine) -> Explained:
+        """The labels with the fewest faults that a machine gives to the trace. Where it does not know where an action leads, that may be anywhere."""
+        steps, count = len(self.seen), len(machine.shows)
+        slip, misread = (np.array(self.price.get(kind, [NEVER] * steps), dtype=float) for kind in ("slipped", "misread"))
+        known = np.zeros((max(self.actions, default=0) + 1, count), dtype=bool)
+        target = np.zeros(known.shape, dtype=int)
+        for (s, action), x in machine.goes.items():
+            known[action, s], target[action, s] = True, x
+        wrong = np.array(machine.shows)[None, :] != np.arange(max(self.seen) + 1)[:, None]
+        free = [np.flatnonzero(~row) for row in known]
+        led = [np.flatnonzero(row) for row in known]
+        spent = wrong[self.seen[0]] * misread[0]
+        came = np.zeros((steps, count), dtype=np.int32)
+        for t in range(1, steps):
+            if t % 500 == 0:
+                self.check()
+            action = self.actions[t - 1]
+            # From the cheapest dstate the action slips to any other, from the cheapest of which nothing is known it leads to any; else it leads where it is known to.
+            cheapest = int(spent.argmin())
+            now = np.full(count, spent[cheapest] + slip[t - 1])
+            came[t] = cheapest
+            if len(free[action]):
+                begin = int(free[action][spent[free[action]].argmin()])
+                better = spent[begin] + UNKNOWN < now
+                came[t][better], now[better] = begin, spent[begin] + UNKNOWN
+            order = led[action][np.argsort(-spent[led[action]], kind="stable")]  # the last one written is the cheapest
+            best = np.full(count, np.inf)
+            source = np.zeros(count, dtype=np.int32)
+            best[target[action, order]], source[target[action, order]] = spent[order], order
+            better = best <= now
+            came[t][better], now[better] = source[better], best[better]
+            spent = now + wrong[self.seen[t]] * misread[t]
+        labels = [int(spent.argmin())]
+        for t in range(steps - 1, 0, -1):
+            labels.append(int(came[t, labels[-1]]))
+        labels.reverse()
+        return self._told(machine, labels)
+
+    def completed(self, machine: Machine) -> Explained:
+        """The same, where what the machine does not know leads where the labels take it to lead most often, so that nothing is unknown."""
+        explained = self.explained(machine)
+        while explained.unknown:
+            votes: dict[tuple[int, int], Counter[int]] = {}
+            for t in explained.unknown:
+                votes.setdefault((explained.labels[t], self.actions[t]), Counter())[explained.labels[t + 1]] += 1
+            led = {key: counts.most_common(1)[0][0] for key, counts in votes.items()}
+            machine = Machine(machine.shows, {**machine.goes, **led})
+            explained = self.explained(machine)
+        return explained
+
+    def read_off(self, labels: Sequence[int]) -> Machine:
+        """The machine of labels: a dstate shows what is mostly seen there, and an action leads where it mostly leads, by what it costs to disbelieve that."""
+        labels = numbered(labels)
+        views: list[Counter[int]] = [Counter() for _ in range(max(labels) + 1)]
+        ends: dict[tuple[int, int], Counter[int]] = {}
+        trust = self.price.get("misread")
+        for t, label in enumerate(labels):
+            views[label][self.seen[t]] += trust[t] if trust else 1
+        for t, action in enumerate(self.actions):
+            ends.setdefault((labels[t], action), Counter())[labels[t + 1]] += 1
+        return Machine([found.most_common(1)[0][0] for found in views], {key: found.most_common(1)[0][0] for key, found in ends.items()})
+
+    def refined(self, labels: Sequence[int]) -> Explained:
+        """The cheapest explanation near these labels: the map is read off, and laid over the trace anew, as long as that gets cheaper; so are those in which dstates are
+        merged that can be one, or without a dstate that is hardly visited.
+        """
+        best = self._settled(labels)
+        while True:
+            better = next((found for found in self._near(best) if found.tenths < best.tenths), None)
+            if better is None:
+                return best
+            best = better
+
+    def _near(self, best: Explained) -> Iterator[Explained]:
+        machine = self.read_off(best.labels)
+        labels = numbered(best.labels)
+        visits = Counter(labels)
+        links: list[Link] = [(s, action, x) for (s, action), x in machine.goes.items()]
+        root = thinned_map(machine.shows, links, [visits[s] for s in range(len(machine.shows))], self.check)
+        if len(set(root)) < len(machine.shows):
+            yield self._settled([root[label] for label in labels])
+        for s, count in sorted(visits.items(), key=lambda item: item[1])[:TRIED]:
+            if count <= RARE and len(machine.shows) > 1:
+                self.check()
+                yield self._settled(self.completed(machine.without(s)).labels)
+        folded = (machine.folded(s, x) for s, x in combinations(range(len(machine.shows)), 2) if machine.shows[s] == machine.shows[x])
+        for _, root in sorted(folded)[:TRIED]:
+            self.check()
+            yield self._settled([root[label] for label in labels])
+
+    def _settled(self, labels: Sequence[int]) -> Explained:
+        """The explanation by the machine of these labels, by the machine of the labels of that, and so on, as long as that gets cheaper."""
+        best = self.completed(self.read_off(labels))
+        while (better := self.completed(self.read_off(best.labels))).tenths < best.tenths:
+            best = better
+        return best
+
+    def _told(self, machine: Machine, labels: Sequence[int]) -> Explained:
+        misread = [t for t, s in enumerate(labels) if machine.shows[s] != self.seen[t]]
+        leads = [machine.goes.get((s, action)) for s, action in zip(labels, self.actions, strict=False)]
+        unknown = [t for t, x in enumerate(leads) if x is None]
+        slips = [t for t, x in enumerate(leads) if x is not None and x != labels[t + 1]]
+        paid = sum(self._cost("misread", t) for t in misread) + sum(self._cost("slipped", t) for t in slips)
+        return Explained(machine, labels, tuple(misread), tuple(slips), tuple(unknown), 10 * len(set(labels)) + paid)
+
+    def _cost(self, kind: str, step: int) -> int:
+        return self.price[kind][step] if kind in self.price else NEVER
+
+
+def robust_maps(explainer: Explainer, seed: int = 0) -> Iterator[Explained | None]:
+    """Explanations of a trace, each cheaper than the one before; None where a start of EM led to none. Whoever asks for the next one waits for another start."""
+    rng = np.random.default_rng(seed)
+    dearer = [round(DEARER * max(found)) for found in zip(*explainer.price.values(), strict=True)]
+    soft = replace(explainer, price={"misread": dearer, "slipped": dearer, **explainer.price})
+    best, agreed = NEVER, 0
+    for clones in CLONES:
+        guess = explainer.completed(soft.refined(_Model(soft, clones, rng).labels()).machine)
+        agreed = agreed + 1 if guess.tenths == best else agreed * (guess.tenths > best) + (guess.tenths < best)
+        yield guess if guess.tenths < best else None
+        best = min(best, guess.tenths)
+        if agreed == AGREE:
+            return
+
+
+class _Model:
+    """A cloned hidden Markov model of one trace. Chances have the shape (actions, states, states): from, and to."""
+
+    def __init__(self, explainer: Explainer, clones: int, rng: np.random.Generator) -> None:
+        self._explainer = explainer
+        seen, views = np.array(explainer.seen), max(explainer.seen) + 1
+        self._shows = np.repeat(np.arange(views), clones)
+        misread = MISREAD if "misread" in explainer.price else 0.0
+        self._sees = np.where(self._shows == np.arange(views)[:, None], 1 - misread, misread / max(views - 1, 1))[seen]
+        self._actions = np.array(explainer.actions, dtype=int)
+        self._slip = SLIPPED if "slipped" in explainer.price else 0.0
+        self._chances = self._normal(rng.random((self._actions.max(initial=0) + 1, len(self._shows), len(self._shows))))
+
+    def labels(self) -> list[int]:
+        """The most probable state of each step, once the model is trained."""
+        before = -np.inf
+        for _ in range(ROUNDS):
+            likelihood = self._train()
+            if likelihood - before < ENOUGH * len(self._sees):
+                break
+            before = likelihood
+        return self._most_probable()
+
+    def _train(self) -> float:
+        """A step of EM. Returns the log-likelihood before it."""
+        steps, states = self._sees.shape
+        ahead = np.ones((steps, states)) / states
+        behind = np.ones((steps, states))
+        scale = np.ones(steps)
+        matrices = list(self._chances)
+        for t in range(steps):
+            message = (ahead[t - 1] @ matrices[self._actions[t - 1]] if t else ahead[0]) * self._sees[t]
+            scale[t] = message.sum()
+            ahead[t] = message / scale[t]
+            if t % 500 == 0:
+                self._explainer.check()
+        for t in range(steps - 2, -1, -1):
+            behind[t] = matrices[self._actions[t]] @ (behind[t + 1] * self._sees[t + 1]) / scale[t + 1]
+            if t % 500 == 0:
+                self._explainer.check()
+        then = behind[1:] * self._sees[1:] / scale[1:, None]
+        taken = [self._chances[a] * (ahead[:-1][self._actions == a].T @ then[self._actions == a]) for a in range(len(matrices))]
+        self._chances = self._normal(np.array(taken) + PSEUDOCOUNT)
+        return float(np.log(scale).sum())
+
+    def _most_probable(self) -> list[int]:
+        with np.errstate(divide="ignore"):
+            matrices, sees = list(np.log(self._chances)), np.log(self._sees)
+        spent = sees[0]
+        came = np.zeros(self._sees.shape, dtype=np.int32)
+        for t in range(1, len(sees)):
+            ways = spent[:, None] + matrices[self._actions[t - 1]]
+            came[t] = ways.argmax(axis=0)
+            spent = ways[came[t], np.arange(len(spent))] + sees[t]
+        labels = [int(spent.argmax())]
+        for t in range(len(sees) - 1, 0, -1):
+            labels.append(int(came[t, labels[-1]]))
+        return labels[::-1]
+
+    def _normal(self, counts: Floats) -> Floats:
+        """Counts as chances, where the action slips now and then."""
+        chances: Floats = counts / counts.sum(axis=2, keepdims=True)
+        slipping: Floats = (1 - self._slip) * chances + self._slip / counts.shape[2]
+        return slipping

@@ -1,0 +1,295 @@
+"""Makes a consistent map without a search: each step leads somewhere new, unless the axioms say where it leads.
+
+>>> from ssh_abduction import Action, Step, Theory
+>>> from ssh_abduction.solver.guesses.tree import Sketch
+>>> sketch = Sketch(Step("end"), Theory(star="none"))
+>>> travel, around = Action("travel", "travel"), Action("around", "turn", "around")
+>>> [sketch.extend(action, Step(view)) for action, view in [(travel, "hall"), (around, "hall"), (travel, "end"), (around, "end")]]
+[True, True, True, True]
+>>> sketch.map().labels
+(0, 1, 2, 3, 0)
+
+A sketch is a tree of paths. A travel leads to a new place, or back along the same path to the place that it came from. So two paths share one place at most,
+and the places ahead on a branch lie on no path that the branch leaves: the axioms of order and sides hold. Within a place the axioms of turns, courses and
+headings decide which dstates are one.
+
+Where the place that a travel would come back to does not show what was seen there before, the travel leads to a new place. Where the trace later contradicts
+that a step was at a known place, the sketch is given up. A sketch without `homing` takes no place for one seen before, unless the axiom next_place asks for it,
+so it may hold where another was given up.
+
+Where the theory asks for no frames, a sketch may still have them: that adds axioms, and leaves none out.
+
+A sketch may also begin with a map of some steps, and grow like a tree beyond it. What is new then lies on new paths, or on one known path, and contradicts
+nothing either. But there are two cases in which the sketch cannot say whether it is consistent: a turn may be the first to show how two known paths cross,
+which has to fit all their places; and without frames, a turn may lead from a dstate to itself, which then can be on no path.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from ssh_abduction.data.maps import DState, Path, SSHMap
+from ssh_abduction.data.trace import Action, Step, Trace, View
+from ssh_abduction.solver.steps.chart import QUARTERS
+from ssh_abduction.solver.steps.log import observation
+from ssh_abduction.theory.theory import Theory
+
+
+class _Contradiction(Exception):  # noqa: N818 - not an error
+    """The axioms ask for what was not seen."""
+
+
+@dataclass(slots=True)
+class _Known:
+    """What is known of a dstate so far."""
+
+    view: View
+    seen: object
+    place: int
+    heading: int
+    path: int | None = None
+    direction: int = 1
+    reverse: list[int] = field(default_factory=list)  # the dstates that a turn around links it to
+
+
+class Sketch:
+    """A map of the steps so far, which grows with each step.
+
+    homing   whether a travel may lead back to where it came from, even if the theory has no axiom next_place
+    framed   whether places have frames, even if the theory asks for none: then most turns lead to known dstates
+    certain  whether the map is known to be consistent. If not, the caller has to check it, and may set this then
+    """
+
+    def __init__(self, first: Step, theory: Theory, homing: bool = True, framed: bool = False) -> None:
+        self.labels: list[int] = []
+        self._theory = theory
+        self._homing = homing or theory.next_place
+        self._framed = framed or theory.star == "frame"
+        self._states: list[_Known] = []
+        self._links: dict[tuple[int, str], int] = {}
+        self._stars: list[object] = []  # for each place, its star
+        self._orders: list[list[int]] = []  # for each path, its places in the order in which direction 1 meets them
+        self._along: dict[tuple[int, int, int], int] = {}  # place, path, direction: dstate
+        self._facing: dict[tuple[int, int], int] = {}  # place, heading: dstate; only where places have frames
+        self._slots: dict[tuple[int, int], tuple[int, int]] = {}  # place, heading: path, direction; only where places have frames
+        self._excused: tuple[tuple[int, int], ...] = ()  # pairs of paths
+        self._map: SSHMap | None = None
+        self._tree = self.certain = True
+        self.labels.append(self._new_place(first))
+        if theory.all_on_paths and theory.level == "topological":
+            self._find_course(0)
+
+    @classmethod
+    def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
+        """All kinds of sketches of a trace that begins with this step. Those that become smaller, if they are not given up, come first."""
+        framed = [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
+        return [cls(first, theory, homing, frames) for frames in framed for homing in (True, False)]
+
+    @classmethod
+    def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Sketch:
+        """A sketch that begins with a map of a trace. The map satisfies all axioms of the theory."""
+        sketch = cls(trace.steps[0], theory)
+        sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.labels)
+        sketch._links = {(s, action): x for s, action, x in ssh_map.links}
+        sketch._excused = ssh_map.excused
+        sketch._orders = [list(path.order) for path in ssh_map.paths]
+        sketch._states, sketch._along, sketch._facing, sketch._slots = [], {}, {}, {}
+        stars: dict[int, object] = {}
+        seen = dict(zip(reversed(ssh_map.labels), reversed(trace.steps), strict=True))
+        for s in ssh_map.dstates:
+            place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
+            assert s.view is not None
+            sketch._states.append(_Known(s.view, observation(seen[s.id], theory), place, heading, s.path, direction))
+            stars.setdefault(place, sketch._star(seen[s.id], heading))
+            if s.path is not None:
+                sketch._along[place, s.path, direction] = s.id
+            if sketch._framed:
+                sketch._facing[place, heading] = s.id
+            if sketch._framed and s.path is not None:
+                sketch._slots[place, heading] = s.path, direction
+                sketch._slots[place, (heading + 2) % 4] = s.path, -direction
+        sketch._stars = [stars[place] for place in sorted(stars)]
+        turns = {action.name: action.turn for action in trace.actions}
+        for here, action, there in ssh_map.links:
+            if turns[action] == "around":
+                sketch._states[here].reverse.append(there)
+                sketch._states[there].reverse.append(here)
+        return sketch
+
+    def extend(self, action: Action, step: Step) -> bool:
+        """Go on with an action and what is seen after it. Returns False where that contradicts the sketch, which is of no use from then on."""
+        here = self.labels[-1]
+        there = self._links.get((here, action.name))
+        try:
+            if there is None:
+                there = self._links[here, action.name] = self._untried(here, action, step)
+                self._map = None
+            self._must_show(there, step)
+        except _Contradiction:
+            return False
+        self.labels.append(there)
+        return True
+
+    def map(self) -> SSHMap:
+        """The sketch as a map of all steps so far, numbered by first visit."""
+        labels = tuple(self.labels)
+        self._map = replace(self._map, labels=labels) if self._map else self._made(labels)
+        return self._map
+
+    def _untried(self, here: int, action: Action, step: Step) -> int:
+        """Where an action leads that was never tried in a dstate."""
+        if self._theory.level == "causal":
+            return self._new(step, 0, 0)
+        if action.slipped:
+            return self._new_place(step)
+        if action.kind == "travel":
+            return self._travel(here, step)
+        return self._turn(here, action, step)
+
+    def _turn(self, here: int, action: Action, step: Step) -> int:
+        """The dstate that a turn leads to which was never tried in this one."""
+        s = self._states[here]
+        around = action.turn == "around"
+        heading = (s.heading + QUARTERS[action.turn]) % 4
+        there: int | None = None
+        if self._framed:
+            there = self._facing.get((s.place, heading))
+        elif around and s.path is not None:
+            there = self._along.get((s.place, s.path, -s.direction))
+        elif around:
+            there = next((x for x in s.reverse if self._states[x].seen == observation(step, self._theory)), None)
+        if there is None:
+            there = self._new(step, s.place, heading)
+        if around:
+            self._turned_around(here, there)
+        elif s.path is not None and self._states[there].path is not None:
+            self._doubt_if_grown_from_map()
+        if self._theory.all_on_paths:
+            self._find_course(there)
+        return there
+
+    def _turned_around(self, here: int, there: int) -> None:
+        """Note that a turn around links two dstates: if one of them has a course, the other has its reverse."""
+        self._states[here].reverse.append(there)
+        self._states[there].reverse.append(here)
+        for s in (self._states[here], self._states[there]):
+            if s.path is not None:
+                self._doubt_if_grown_from_map()
+                for x in s.reverse:
+                    self._set_course(x, s.path, -s.direction)
+
+    def _travel(self, here: int, step: Step) -> int:
+        """The dstate that a travel leads to which was never tried in this one."""
+        path, direction = self._find_course(here)
+        place, order = self._states[here].place, self._orders[path]
+        position = order.index(place)
+        if self._homing and 0 <= position + direction < len(order):
+            there = self._known_ahead(order[position + direction], path, direction, step)
+            if there is not None:
+                return there
+            if self._theory.next_place:
+                raise _Contradiction
+        there = self._new_place(step)
+        order.insert(position + (direction == 1), self._states[there].place)
+        self._set_course(there, path, direction)
+        return there
+
+    def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
+        """The dstate at which a travel along a path would end at a known place; None if what is seen does not fit the place."""
+        there = self._along.get((place, path, direction))
+        heading = 0
+        if there is None and self._framed:
+            heading = next(k for k in range(4) if self._slots.get((place, k)) == (path, direction))
+            there = self._facing.get((place, heading))
+        if there is None:
+            if self._star(step, heading) != self._stars[place]:
+                return None
+            there = self._new(step, place, heading)
+        elif self._states[there].seen != observation(step, self._theory):
+            return None
+        else:
+            self._doubt_if_grown_from_map()
+        self._set_course(there, path, direction)
+        return there
+
+    def _find_course(self, here: int) -> tuple[int, int]:
+        """The path and direction of a dstate. A dstate that has none gets the path that leaves through its slot, or a new path."""
+        s = self._states[here]
+        if s.path is None:
+            path, direction = self._slots.get((s.place, s.heading), (len(self._orders), 1))  # without frames there are no slots
+            if path < len(self._orders) or not self._framed:
+                self._doubt_if_grown_from_map()
+            if path == len(self._orders):
+                self._orders.append([s.place])
+            self._set_course(here, path, direction)
+            return path, direction
+        return s.path, s.direction
+
+    def _doubt_if_grown_from_map(self) -> None:
+        """Note that the last action may be the first to join two paths of the map that the sketch began with. A sketch that is a tree stays certain."""
+        self.certain = self._tree
+
+    def _set_course(self, here: int, path: int, direction: int) -> None:
+        """Give a dstate its course, and the reverse of it to all dstates that turns around link it to."""
+        s = self._states[here]
+        if (s.path, s.direction) == (path, direction):
+            return
+        if s.path is not None or self._along.setdefault((s.place, path, direction), here) != here:
+            raise _Contradiction
+        s.path, s.direction = path, direction
+        if self._framed:
+            self._slots[s.place, s.heading] = path, direction
+            self._slots[s.place, (s.heading + 2) % 4] = path, -direction
+        for x in s.reverse:
+            self._set_course(x, path, -direction)
+
+    def _new_place(self, step: Step) -> int:
+        """A dstate at a new place."""
+        self._stars.append(self._star(step, 0))
+        return self._new(step, len(self._stars) - 1, 0)
+
+    def _new(self, step: Step, place: int, heading: int) -> int:
+        """A new dstate at a place."""
+        assert step.view is not None
+        if self._star(step, heading) != self._stars[place]:
+            raise _Contradiction
+        self._states.append(_Known(step.view, observation(step, self._theory), place, heading))
+        if self._framed:
+            self._facing[place, heading] = len(self._states) - 1
+        return len(self._states) - 1
+
+    def _star(self, step: Step, heading: int) -> object:
+        """The star of a place at which this is seen with this heading, in the frame of the place if it has one."""
+        star = step.openings if self._theory.star in ("pattern", "frame") else None
+        if self._framed and star is not None:
+            return tuple(star[(slot - heading) % 4] for slot in range(4))
+        return observation(step, self._theory)[1]
+
+    def _must_show(self, there: int, step: Step) -> None:
+        """Raises _Contradiction where a step does not show what was seen at this dstate before."""
+        if self._states[there].seen != observation(step, self._theory):
+            raise _Contradiction
+
+    def _made(self, labels: tuple[int, ...]) -> SSHMap:
+        """The sketch as a map, made anew."""
+        links = tuple(sorted((s, action, x) for (s, action), x in self._links.items()))
+        if self._theory.level == "causal":
+            return SSHMap(labels, tuple(DState(i, s.view) for i, s in enumerate(self._states)), links)
+        first: dict[int, tuple[int, int]] = {}  # for each path, its number in the map, and the direction that is faced first
+        for s in self._states:
+            if s.path is not None:
+                first.setdefault(s.path, (len(first), s.direction))
+        dstates = tuple(
+            DState(
+                id=i,
+                view=s.view,
+                place=s.place,
+                path=None if s.path is None else first[s.path][0],
+                direction=None if s.path is None else s.direction * first[s.path][1],
+                heading=s.heading if self._theory.star == "frame" else None,
+            )
+            for i, s in enumerate(self._states)
+        )
+        paths = tuple(Path(number, tuple(self._orders[path][::direction])) for path, (number, direction) in first.items())
+        excused = [sorted((first[h][0], first[g][0])) for h, g in self._excused]
+        return SSHMap(labels, dstates, links, tuple(range(len(self._stars))), paths, tuple(sorted((h, g) for h, g in excused)))

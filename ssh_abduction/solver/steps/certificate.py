@@ -1,0 +1,115 @@
+"""Why no map has fewer dstates, for anybody to check (`judge/proof.py`).
+
+>>> from ssh_abduction import Trace, solve
+>>> trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
+>>> solve(trace).certificate.clique
+(0, 1, 2, 3)
+>>> solve(trace).certificate.words(trace)[0, 2]
+('travel',)
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import Any
+
+from ssh_abduction.data.errors import SolverError
+from ssh_abduction.data.trace import Trace, View, checked_trace
+from ssh_abduction.data.words import counted
+from ssh_abduction.solver.steps.noise import Noise, noise_in
+
+RESTS_ON = frozenset({"functional_view", "deterministic"})  # the axioms that make apart steps different dstates
+# A certificate in a file has its words only if they have at most this many actions in all, some megabytes. Where steps look alike for long, words grow with
+# the cube of the trace; and whoever checks the certificate can find them anew.
+WRITTEN = 500_000
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """Why no map has fewer dstates.
+
+    clique   steps that are pairwise apart, so that each is a dstate of its own; proof.check_bound checks it, without a solver
+    refuted  numbers of dstates, from the size of the clique up, for which clingo found that there is no map
+    """
+
+    clique: tuple[int, ...]
+    refuted: tuple[int, ...] = ()
+
+    def __repr__(self) -> str:
+        refuted = f", and clingo refuted {counted(len(self.refuted), 'sizes')}" if self.refuted else ""
+        return f"<Certificate: at least {counted(self.bound, 'dstates')}; {counted(len(self.clique), 'steps')} are pairwise apart{refuted}>"
+
+    @property
+    def bound(self) -> int:
+        """The number of dstates that every map has at least."""
+        return len(self.clique) + len(self.refuted)
+
+    def words(self, trace: Trace) -> dict[tuple[int, int], tuple[str, ...]]:
+        """For each pair of steps of the clique the common actions that lead from them to different views. Raises SolverError."""
+        checked_trace(trace)
+        return {pair: _word(trace, *pair) for pair in combinations(self.clique, 2)}
+
+    def to_dict(self, trace: Trace | None) -> dict[str, Any]:
+        """Plain data. Pairs that show different views at once need no word and are left out. Words of more than WRITTEN actions in all are left out, too, and so are all words where the trace is not at hand."""
+        if trace is None:
+            return {"clique": list(self.clique), "refuted": list(self.refuted)}
+        checked_trace(trace)
+        words: list[list[Any]] = []
+        written = 0
+        for i, j in self._pairs_alike(trace):
+            word = _word(trace, i, j)
+            words.append([i, j, list(word)])
+            written += len(word)
+            if written > WRITTEN:
+                return {"clique": list(self.clique), "refuted": list(self.refuted)}
+        return {"clique": list(self.clique), "words": words, "refuted": list(self.refuted)}
+
+    def _pairs_alike(self, trace: Trace) -> Iterator[tuple[int, int]]:
+        """The pairs of steps of the clique that show one view, in order. All other pairs, of which there may be millions, need no word."""
+        alike: dict[View | None, list[int]] = {}
+        for step in self.clique:
+            alike.setdefault(trace.steps[step].view, []).append(step)
+        for i in self.clique:
+            same = alike[trace.steps[i].view]
+            yield from ((i, j) for j in same[bisect_right(same, i) :])
+
+
+@dataclass(frozen=True)
+class Basis:
+    """What a certificate is made of, once somebody asks for it: to make it takes as long as to solve a short trace.
+
+    views    what was seen at the first steps of the trace, as numbers
+    actions  what was done there, as numbers
+    bound    the proven least number of dstates
+    """
+
+    views: tuple[int, ...]
+    actions: tuple[int, ...]
+    bound: int
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        from ssh_abduction.solver.steps.apart import Continuations  # loads numpy, which takes longer than to solve a short trace
+
+        clique = tuple(Continuations(self.views, self.actions).clique())
+        return Certificate(clique, tuple(range(len(clique), self.bound)))
+
+    @cached_property
+    def noise(self) -> Noise | None:
+        return noise_in(self.views, self.actions)
+
+
+def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:
+    """The common actions that lead from steps i and j to different views."""
+    word: list[str] = []
+    while True:
+        here, there = trace.steps[i + len(word)], trace.steps[j + len(word)]
+        if here.view != there.view:
+            return tuple(word)
+        if here.action is None or there.action is None or here.action.name != there.action.name:
+            raise SolverError(f"clique: expected steps that are apart, got {i} and {j}, which may be one dstate")
+        word.append(here.action.name)
