@@ -14,9 +14,9 @@ from strategies import TOYS, theories, traces
 
 from ssh_abduction import Status, Theory, Trace, TraceError, solve
 from ssh_abduction.cli import main
-from ssh_abduction.explain import Axioms, Piece
-from ssh_abduction.rivals.derivation import Derivation
-from ssh_abduction.rivals.explain import PairExplanation, Verdict, explain_pair, explain_trace
+from ssh_abduction.explain.derivation import Derivation
+from ssh_abduction.explain.no_map import Axioms, Piece
+from ssh_abduction.explain.pairs import PairExplanation, Verdict, explain_pair, explain_trace
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.theory.encodings import axioms
 
@@ -279,7 +279,7 @@ def test_what_was_interrupted_is_said_so(tmp_path: Path, capsys: pytest.CaptureF
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("ssh_abduction.rivals.explain.derive", interrupted)
+    monkeypatch.setattr("ssh_abduction.explain.pairs.derive", interrupted)
     RECTANGLE.prefix(5).save(tmp_path / "rectangle.jsonl")
     assert main(["explain", str(tmp_path / "rectangle.jsonl"), "0", "4"]) == 130
     assert capsys.readouterr().out.endswith("different dstates in every map\nwhich axioms it takes was not found out (interrupted)\n")

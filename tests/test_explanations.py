@@ -16,7 +16,7 @@ from test_displacement import WHITE, circuit
 from ssh_abduction import Odometry, Status, Theory, Trace, TraceError, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
-from ssh_abduction.explain import explain, why_apart
+from ssh_abduction.explain.no_map import explain, why_apart
 from ssh_abduction.theory.evidence import evidence_of, pairs_of
 from ssh_abduction.theory.pairs import pairs_in
 

@@ -17,7 +17,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.odometry import in_words
-from ssh_abduction.explain import explain
+from ssh_abduction.explain.no_map import explain
 from ssh_abduction.solver.front import fault_front
 from ssh_abduction.solver.guesses.jumps import wrong_displacements
 from ssh_abduction.theory.speedups import SPEEDUPS

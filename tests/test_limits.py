@@ -19,7 +19,7 @@ from worlds import rectangle
 
 from ssh_abduction import Search, Status, Theory, Trace, solve
 from ssh_abduction.checker.proof import check_bound
-from ssh_abduction.explain import Axioms, Interrupted, Piece
+from ssh_abduction.explain.no_map import Axioms, Interrupted, Piece
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory

@@ -22,7 +22,7 @@ from ssh_abduction import OnlineMapper, Search, Speedups, SSHMap, Status, Theory
 from ssh_abduction.checker import check
 from ssh_abduction.checker.checker import unchecked
 from ssh_abduction.cli import main
-from ssh_abduction.explain import explain
+from ssh_abduction.explain.no_map import explain
 from ssh_abduction.online import mapper as mapper_module
 from ssh_abduction.solver import judging, prefixes, search
 from ssh_abduction.solver.engines.causal import CausalEngine

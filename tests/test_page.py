@@ -39,8 +39,8 @@ from ssh_abduction.cli import main
 from ssh_abduction.cli.options import add_theory, flags_of, theory_of
 from ssh_abduction.data.maps import Fault, Fit, Pose
 from ssh_abduction.data.maps import Path as MapPath
+from ssh_abduction.explain.pairs import explain_pair
 from ssh_abduction.rivals.assumed import assumptions
-from ssh_abduction.rivals.explain import explain_pair
 from ssh_abduction.rivals.page import html
 from ssh_abduction.rivals.page.content import DRAWN, content_of
 from ssh_abduction.rivals.page.html import Page

@@ -42,7 +42,7 @@ from ssh_abduction.cli.text import headline
 from ssh_abduction.data.errors import SolverError, SSHError, brief, named, printable
 from ssh_abduction.data.program import SIGNALLED, interrupted_code
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain import Explanation
+from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.asp.limits import POLL
 from ssh_abduction.solver.asp.limits import Stop as SearchStop

@@ -11,7 +11,7 @@ from ssh_abduction.cli.outcome import dump, on_ctrl_c
 from ssh_abduction.data.errors import MapError, SSHError, named
 from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.rivals.explain import PairExplanation, PairQuestion, TraceExplanation, TraceQuestion, Verdict
+from ssh_abduction.explain.pairs import PairExplanation, PairQuestion, TraceExplanation, TraceQuestion, Verdict
 from ssh_abduction.solver.asp.limits import Stop
 from ssh_abduction.solver.recorded import theory_in
 from ssh_abduction.theory.theory import Theory

@@ -31,7 +31,7 @@ from ssh_abduction.cli.text import by_displacements, compared, describe, describ
 from ssh_abduction.data.logs import PROGRESS
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain import Explanation
+from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.solver.asp.limits import Stop
 from ssh_abduction.solver.result import Progress, Solution, Status, summary_of
 from ssh_abduction.solver.search import Search

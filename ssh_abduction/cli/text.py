@@ -10,7 +10,7 @@ from ssh_abduction.data.errors import printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted as counted  # noqa: PLC0414 - the verbs have it from here
-from ssh_abduction.explain import Explanation
+from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.solver.result import Solution, Status
 from ssh_abduction.solver.sharing import Backbone, stretches
 from ssh_abduction.theory.evidence import evidence_of

@@ -13,8 +13,8 @@ import time
 from collections.abc import Iterator
 
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain import Axioms, Interrupted, Piece
-from ssh_abduction.rivals.explain import SMALL, UNCUT, PairExplanation, Side, Verdict
+from ssh_abduction.explain.no_map import Axioms, Interrupted, Piece
+from ssh_abduction.explain.pairs import SMALL, UNCUT, PairExplanation, Side, Verdict
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.engines.base import Cost

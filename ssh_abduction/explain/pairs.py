@@ -22,8 +22,8 @@ from typing import Any
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import SolverError, SSHError, TraceError, brief, is_whole
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View, checked_trace
-from ssh_abduction.explain import Axioms, Explanation, Interrupted, Piece, explain
-from ssh_abduction.rivals.derivation import Derivation, derive
+from ssh_abduction.explain.derivation import Derivation, derive
+from ssh_abduction.explain.no_map import Axioms, Explanation, Interrupted, Piece, explain
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, Stop, Watch, check_limit
 from ssh_abduction.solver.asp.rules import check_rules

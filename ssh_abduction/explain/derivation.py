@@ -1,7 +1,7 @@
 """Why two steps are different dstates in every map, or one: a smallest set of axioms and steps, as an argument whose every line follows from the lines before it.
 
 >>> from ssh_abduction import Theory, Trace
->>> from ssh_abduction.explain import Piece
+>>> from ssh_abduction.explain.no_map import Piece
 >>> trace = Trace.from_steps(views=["v0", "v1", "v2", "v3", "v0"], actions=["right", "travel", "right", "travel"])
 >>> theory = Theory.topological().resolve(trace)
 >>> print(derive(Piece.of(trace, theory, range(5)), trace, 0, 4, one=False).summary)
@@ -24,7 +24,7 @@ import clingo
 from ssh_abduction.checker.checker import Violation, check, unchecked
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain import Assumption, Axioms, Clash, Piece, why_apart
+from ssh_abduction.explain.no_map import Assumption, Axioms, Clash, Piece, why_apart
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import EXCUSED

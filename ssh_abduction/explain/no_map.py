@@ -1,7 +1,7 @@
 """Why a trace has no map: the shortest stretch of it that has none, and a smallest set of axioms and steps that clash there.
 
 >>> from ssh_abduction import Theory, Trace
->>> from ssh_abduction.explain import explain
+>>> from ssh_abduction.explain.no_map import explain
 >>> trace = Trace.from_steps(views=["a", "b", "c", "d"], actions=["travel", "around", "around"])
 >>> explanation = explain(trace, Theory.topological())
 >>> explanation.first, explanation.last, explanation.axioms[0]
