@@ -27,10 +27,10 @@ from perception.views import ViewClusterer
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.learner import BootstrapLearner, LearnerError
+from ssh_abduction.learning.learner import BootstrapLearner, LearnerError
+from ssh_abduction.learning.traces import Traces
 from ssh_abduction.reproduce.claims import one_to_one, true_dstates
 from ssh_abduction.theory.theory import Theory
-from ssh_abduction.traces import Traces
 
 SHARE = 0.05
 SECONDS = 10.0

@@ -38,7 +38,7 @@ from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
 from simulator.world import World
 from ssh_abduction import Localiser, Trace
-from ssh_abduction.learner import BootstrapLearner
+from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.localize import LOCATED, Chances
 from ssh_abduction.reproduce.claims import one_to_one
 

@@ -51,7 +51,7 @@ from ssh_abduction import (
     solve,
     view_page,
 )
-from ssh_abduction.learner import BootstrapLearner
+from ssh_abduction.learning.learner import BootstrapLearner
 
 SHIPPED = Path(inspect.getfile(World)).parent / "worlds" / "notched-rectangle.json"
 

@@ -31,13 +31,13 @@ from simulator.laser import BEARINGS, Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Step, Theory, Trace, solve
-from ssh_abduction import learner as learner_module
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import TraceError
-from ssh_abduction.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning, labels_of
+from ssh_abduction.learning import learner as learner_module
+from ssh_abduction.learning.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning, labels_of
+from ssh_abduction.learning.runner_up import runner_up, second_map, with_runner_up
 from ssh_abduction.reproduce.claims import EXPERIMENTS, Run, claims, measure, one_to_one, outcome, rate, summary, true_dstates
-from ssh_abduction.runner_up import runner_up, second_map, with_runner_up
 
 VIEWS_ALONE = Theory.topological().replace(star="none")
 FEW_CIRCUITS = replace(EXPERIMENTS["notched-rectangle"], tours=10, k_max=8)

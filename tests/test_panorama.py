@@ -27,7 +27,7 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.cli import main
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.learner import BootstrapLearner
+from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.reproduce.claims import VIEWS_ALONE, one_to_one, true_dstates
 
 ROOM = World.named("notched-rectangle")

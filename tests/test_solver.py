@@ -42,7 +42,7 @@ from ssh_abduction import (
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.errors import SSHError
 from ssh_abduction.explain.no_map import Interrupted, explain
-from ssh_abduction.learner import BootstrapLearner
+from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver import search as solver_module
 from ssh_abduction.solver.asp.facts import links_of

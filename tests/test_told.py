@@ -225,11 +225,11 @@ def test_without_shtab_it_is_named(capsys: pytest.CaptureFixture[str], monkeypat
 def test_the_bootstrap_loop_tells_its_stages(caplog: pytest.LogCaptureFixture) -> None:
     from simulator.tours import simulate
     from simulator.world import World
-    from ssh_abduction.learner import BootstrapLearner
+    from ssh_abduction.learning.learner import BootstrapLearner
 
     run = simulate(World.named("notched-rectangle"), tours=4, seed=1)
     with caplog.at_level(logging.INFO, "ssh_abduction"):
         learner = BootstrapLearner().fit(run)
-    told = [record.getMessage() for record in caplog.records if record.name == "ssh_abduction.learner"]
+    told = [record.getMessage() for record in caplog.records if record.name == "ssh_abduction.learning.learner"]
     assert told == [f"{len(run)} images, 4 views", "a map of 8 dstates", f"a recogniser of {len(run)} images"]
     assert np.all(learner.labels_ >= 0)

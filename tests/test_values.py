@@ -34,7 +34,7 @@ from ssh_abduction import (
     solve,
 )
 from ssh_abduction.data import maps
-from ssh_abduction.labels import LearnerError
+from ssh_abduction.learning.labels import LearnerError
 from ssh_abduction.solver.judging import InternalError
 
 ROOT = Path(__file__).parent.parent

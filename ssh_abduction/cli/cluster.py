@@ -14,7 +14,7 @@ from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import SSHError
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runner_up import SECONDS, runner_up, second_map, with_runner_up
+from ssh_abduction.learning.runner_up import SECONDS, runner_up, second_map, with_runner_up
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.theory import Theory
 

@@ -15,7 +15,7 @@ from ssh_abduction.data import program
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.no_map import Explanation, Interrupted, explain
-from ssh_abduction.runner_up import second_map
+from ssh_abduction.learning.runner_up import second_map
 from ssh_abduction.solver import Search, Solution, Status, result
 from ssh_abduction.solver.engines.base import Cost
 from ssh_abduction.solver.sharing import Backbone

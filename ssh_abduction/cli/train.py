@@ -64,7 +64,7 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
     """The images and their labels, the map whose labels they are, and what makes features of the images."""
     from perception.appearance import features_of
     from perception.images import images_of
-    from ssh_abduction.learner import labels_of
+    from ssh_abduction.learning.learner import labels_of
 
     trace = Trace.load(options.trace)
     data = read_json(options.maps)

@@ -23,7 +23,7 @@ from simulator.world import World
 from ssh_abduction.data import program
 from ssh_abduction.data.errors import SSHError
 from ssh_abduction.data.files import write_file
-from ssh_abduction.learner import BootstrapLearner
+from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output.picture import svg
 from ssh_abduction.reproduce import figures
 from ssh_abduction.reproduce.claims import (

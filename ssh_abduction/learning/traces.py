@@ -16,7 +16,7 @@ from perception.errors import PerceptionError
 from perception.images import images_of
 from ssh_abduction.data.errors import TraceError, brief
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runner_up import with_runner_up
+from ssh_abduction.learning.runner_up import with_runner_up
 
 Integers = NDArray[np.intp]
 

@@ -14,8 +14,8 @@ from perception.recognition import recogniser
 from ssh_abduction.data.errors import SSHError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.learning.traces import Traces
 from ssh_abduction.solver.result import Solution, Status
-from ssh_abduction.traces import Traces
 
 
 class LearnerError(SSHError, ValueError):
