@@ -29,8 +29,8 @@ from simulator.laser import Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.evaluation.paper.claims import VIEWS_ALONE, notched, one_to_one, true_dstates
 from ssh_abduction.learning.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning
-from ssh_abduction.reproduce.claims import VIEWS_ALONE, notched, one_to_one, true_dstates
 from ssh_abduction.solver.search import solve
 
 WORLD = World.named("notched-rectangle")

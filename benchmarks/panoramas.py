@@ -44,8 +44,8 @@ from simulator.panorama import Camera, Paint
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.evaluation.paper.claims import VIEWS_ALONE, one_to_one, true_dstates
 from ssh_abduction.learning.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning
-from ssh_abduction.reproduce.claims import VIEWS_ALONE, one_to_one, true_dstates
 
 Pixels = NDArray[np.float64]
 SECONDS, MOST_VIEWS = 2.0, 24

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from ssh_abduction.data.odometry import Odometry
     from ssh_abduction.data.trace import Action, Step, Trace
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, VisitsEvaluation, evaluate, evaluate_visits
+    from ssh_abduction.evaluation.ladder import Rung, ladder
     from ssh_abduction.explorer import Exploration, Explorer
     from ssh_abduction.localize import Belief, Chances, Localiser
     from ssh_abduction.online.mapper import OnlineMapper
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.rivals.page.html import Page, view_page
     from ssh_abduction.routes import Move, Route, route
-    from ssh_abduction.rungs import Rung, ladder
     from ssh_abduction.solver.engines.base import Cost
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
@@ -51,7 +51,7 @@ _HOMES = {  # module: the names that it exports
     "rivals.page.html": ("Page", "view_page"),
     "rivals.explore": ("Experiment", "next_experiment"),
     "routes": ("Move", "Route", "route"),
-    "rungs": ("Rung", "ladder"),
+    "evaluation.ladder": ("Rung", "ladder"),
     "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),
     "solver.sharing": ("Backbone",),

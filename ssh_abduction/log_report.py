@@ -18,8 +18,8 @@ from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.data.words import counted
+from ssh_abduction.evaluation.ladder import Rung
 from ssh_abduction.output.drawing import COLOURS, escaped, page, text
-from ssh_abduction.rungs import Rung
 from ssh_abduction.solver.result import Solution
 
 Array = NDArray[np.float64]

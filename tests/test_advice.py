@@ -35,7 +35,7 @@ SAID_BY = {
     "ssh_abduction/explain/no_map.py": WITH_THEORY,
     "ssh_abduction/solver/front.py": ("solve",),
     "ssh_abduction/log_report.py": ("map",),
-    "ssh_abduction/reproduce": ("reproduce",),
+    "ssh_abduction/evaluation/paper": ("reproduce",),
     "ssh_abduction/explain/pairs.py": ("explain",),
     "ssh_abduction/rivals/page/server.py": ("view",),
     "ssh_abduction/routes.py": ("route",),

@@ -12,7 +12,7 @@ import truth
 
 from ssh_abduction import Odometry, Theory, Trace, solve
 from ssh_abduction.cli import main
-from ssh_abduction.rungs import Rung, UnderWay, ladder
+from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder
 
 SQUARE = Trace.from_steps("ab" * 4 + "a", ["travel", "right"] * 4, displacements=[(10, 0, 0), (0, 0, -1.5708)] * 4)
 
@@ -69,7 +69,7 @@ def test_where_faults_are_allowed_planarity_is_no_rung() -> None:
 def test_the_shell_prints_a_row_a_rung(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "route.jsonl"
     aces3().trace.save(path)
-    with patch("ssh_abduction.rungs.ladder", lambda *_, **__: iter(climbed())):
+    with patch("ssh_abduction.evaluation.ladder.ladder", lambda *_, **__: iter(climbed())):
         assert main(["ladder", str(path)]) == 0
     head, *rows = capsys.readouterr().out.splitlines()
     assert head.split()[:2] == ["minimal", "maps"]

@@ -34,10 +34,10 @@ from ssh_abduction import Step, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import TraceError
+from ssh_abduction.evaluation.paper.claims import EXPERIMENTS, Run, claims, measure, one_to_one, outcome, rate, summary, true_dstates
 from ssh_abduction.learning import learner as learner_module
 from ssh_abduction.learning.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning, labels_of
 from ssh_abduction.learning.runner_up import runner_up, second_map, with_runner_up
-from ssh_abduction.reproduce.claims import EXPERIMENTS, Run, claims, measure, one_to_one, outcome, rate, summary, true_dstates
 
 VIEWS_ALONE = Theory.topological().replace(star="none")
 FEW_CIRCUITS = replace(EXPERIMENTS["notched-rectangle"], tours=10, k_max=8)
@@ -486,7 +486,7 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     """With few circuits, so that it is quick; the claims themselves are measured by `reproduce`, over 20 seeds."""
     monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", FEW_CIRCUITS)
     known = {("notched-rectangle", 500): measured}
-    monkeypatch.setattr("ssh_abduction.reproduce.report.measure", lambda *asked: known[asked])
+    monkeypatch.setattr("ssh_abduction.evaluation.paper.report.measure", lambda *asked: known[asked])
     words = ["reproduce", "notched-rectangle", "--seeds", "500", "--jobs", "1", "--no-outcomes", "-o", str(tmp_path)]
     assert main(words) == 0
     out = capsys.readouterr().out
@@ -507,7 +507,7 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     assert configuration["versions"]["clingo"]
     claimed = json.loads((tmp_path / "claims.json").read_text())
     assert all(row["seeds"] == 1 for row in claimed)
-    monkeypatch.setattr("ssh_abduction.reproduce.report._draw", lambda *_: None)  # once is enough
+    monkeypatch.setattr("ssh_abduction.evaluation.paper.report._draw", lambda *_: None)  # once is enough
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["claims"] == claimed
 

@@ -212,7 +212,7 @@ def test_a_picture_that_fails_loses_nothing(tmp_path: Path, learnt: list[str], c
 def test_a_reproduction_writes_its_data_before_it_draws(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ssh_abduction.reproduce import report
+    from ssh_abduction.evaluation.paper import report
 
     def fails(*_: Any) -> None:
         raise OSError(28, "No space left on device")

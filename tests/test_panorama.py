@@ -27,8 +27,8 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.cli import main
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.evaluation.paper.claims import VIEWS_ALONE, one_to_one, true_dstates
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.reproduce.claims import VIEWS_ALONE, one_to_one, true_dstates
 
 ROOM = World.named("notched-rectangle")
 SMALL = Camera(rows=12, columns=60, paint=Paint(5, repeated=True), hours=(7.0, 19.0))

@@ -20,9 +20,9 @@ from aces import ACES
 from ssh_abduction import Solution, SSHError, Theory, Trace
 from ssh_abduction.cli import main
 from ssh_abduction.data import program
+from ssh_abduction.evaluation.ladder import UnderWay
+from ssh_abduction.evaluation.paper import report
 from ssh_abduction.log_maps import LogMapping
-from ssh_abduction.reproduce import report
-from ssh_abduction.rungs import UnderWay
 from ssh_abduction.solver.asp import process, workers
 from ssh_abduction.solver.asp.limits import Watch
 

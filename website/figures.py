@@ -22,9 +22,9 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Trace, solve
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.evaluation.paper.figures import draw_quality, draw_telling, draw_views, draw_world
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output.picture import svg
-from ssh_abduction.reproduce.figures import draw_quality, draw_telling, draw_views, draw_world
 
 ROOT = Path(__file__).parent.parent
 FIGURES = ROOT / "docs" / "figures"

@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
     warn(doubts(clustered))
     if options.plot:
         sys.stdout.flush()  # a picture that fails loses nothing of this
-        from ssh_abduction.reproduce.figures import draw_quality
+        from ssh_abduction.evaluation.paper.figures import draw_quality
 
         draw_quality(options.plot, clusterer.quality_, uncertainty, clusterer.k_)
     return 0

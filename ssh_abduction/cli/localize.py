@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
         print(table(HEAD, [_row(step, belief, trace) for step, belief in enumerate(beliefs)]))
     if options.plot:
         sys.stdout.flush()  # a picture that fails loses nothing of this
-        from ssh_abduction.reproduce.figures import draw_beliefs
+        from ssh_abduction.evaluation.paper.figures import draw_beliefs
 
         draw_beliefs(options.plot, beliefs)
     return 0

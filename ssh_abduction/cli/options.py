@@ -82,7 +82,7 @@ def check_picture(file: str | None) -> None:
     """Whether a picture that is asked for could be drawn, before hours of work. Raises SSHError."""
     if file is None:
         return
-    from ssh_abduction.reproduce.figures import require_matplotlib
+    from ssh_abduction.evaluation.paper.figures import require_matplotlib
 
     require_matplotlib()
 

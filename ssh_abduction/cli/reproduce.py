@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from ssh_abduction.reproduce.report import reproduce, steps
+    from ssh_abduction.evaluation.paper.report import reproduce, steps
 
     seeds = _seeds(options.seeds)
     if options.jobs == 0:
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _print(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
-    from ssh_abduction.reproduce.report import claimed, spread_of
+    from ssh_abduction.evaluation.paper.report import claimed, spread_of
 
     if options.json:
         print(json.dumps({"experiment": options.experiment, "claims": rows}, ensure_ascii=False, indent=1), flush=True)

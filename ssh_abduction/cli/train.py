@@ -111,7 +111,7 @@ def run_learning_curve(options: argparse.Namespace) -> int:
         print(table(["images", "recognised", "worst fold", "best fold"], rows))
     if options.plot:
         sys.stdout.flush()  # a picture that fails loses nothing of this
-        from ssh_abduction.reproduce.figures import draw_learning
+        from ssh_abduction.evaluation.paper.figures import draw_learning
 
         draw_learning(options.plot, {"map": curve})
     return 0
@@ -161,7 +161,7 @@ def run_tell_apart(options: argparse.Namespace) -> int:
         print(table(["dstates", "told apart", *(f"beams by {method}" for method in next(iter(found.values())).methods)], rows))
     if options.plot:
         sys.stdout.flush()  # a picture that fails loses nothing of this
-        from ssh_abduction.reproduce.figures import draw_telling
+        from ssh_abduction.evaluation.paper.figures import draw_telling
 
         draw_telling(options.plot, ranges, labels, found)
     return 0

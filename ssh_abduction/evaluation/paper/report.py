@@ -23,10 +23,8 @@ from simulator.world import World
 from ssh_abduction.data import program
 from ssh_abduction.data.errors import SSHError
 from ssh_abduction.data.files import write_file
-from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.output.picture import svg
-from ssh_abduction.reproduce import figures
-from ssh_abduction.reproduce.claims import (
+from ssh_abduction.evaluation.paper import figures
+from ssh_abduction.evaluation.paper.claims import (
     EXPERIMENTS,
     VIEWS_ALONE,
     WITH_STARS,
@@ -38,6 +36,8 @@ from ssh_abduction.reproduce.claims import (
     to_dict,
     true_dstates,
 )
+from ssh_abduction.learning.learner import BootstrapLearner
+from ssh_abduction.output.picture import svg
 from ssh_abduction.solver.asp import workers
 
 NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)  # metres

@@ -1,7 +1,7 @@
 """What each kind of evidence is worth for a trace: the minimal maps by views alone, and then with one kind more on each rung.
 
 >>> from ssh_abduction import Theory, Trace
->>> from ssh_abduction.rungs import ladder
+>>> from ssh_abduction.evaluation.ladder import ladder
 >>> square = [(10, 0, 0), (0, 0, -1.5708)] * 4
 >>> trace = Trace.from_steps("ab" * 4 + "a", ["travel", "right"] * 4, displacements=square)
 >>> [(rung.name, rung.solution.cost.places, rung.solution.count) for rung in ladder(trace)]
