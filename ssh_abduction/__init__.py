@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from ssh_abduction.localize import Belief, Chances, Localiser
     from ssh_abduction.online.mapper import OnlineMapper
     from ssh_abduction.output.export.formats import export_map
+    from ssh_abduction.page.html import Page, view_page
     from ssh_abduction.rivals.compare import Comparison, compare
     from ssh_abduction.rivals.difference import Difference, difference
     from ssh_abduction.rivals.explore import Experiment, next_experiment
     from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.rivals.page.html import Page, view_page
     from ssh_abduction.routes import Move, Route, route
     from ssh_abduction.solver.engines.base import Cost
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
@@ -48,7 +48,7 @@ _HOMES = {  # module: the names that it exports
     "rivals.compare": ("Comparison", "compare"),
     "rivals.difference": ("Difference", "difference"),
     "rivals.listing": ("Listing",),
-    "rivals.page.html": ("Page", "view_page"),
+    "page.html": ("Page", "view_page"),
     "rivals.explore": ("Experiment", "next_experiment"),
     "routes": ("Move", "Route", "route"),
     "evaluation.ladder": ("Rung", "ladder"),

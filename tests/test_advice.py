@@ -37,7 +37,7 @@ SAID_BY = {
     "ssh_abduction/log_report.py": ("map",),
     "ssh_abduction/evaluation/paper": ("reproduce",),
     "ssh_abduction/explain/pairs.py": ("explain",),
-    "ssh_abduction/rivals/page/server.py": ("view",),
+    "ssh_abduction/page/server.py": ("view",),
     "ssh_abduction/routes.py": ("route",),
     "ssh_abduction/solver/search.py": ("solve",),
     "ssh_abduction/theory": WITH_THEORY,

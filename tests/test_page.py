@@ -40,12 +40,12 @@ from ssh_abduction.cli.options import add_theory, flags_of, theory_of
 from ssh_abduction.data.maps import Fault, Fit, Pose
 from ssh_abduction.data.maps import Path as MapPath
 from ssh_abduction.explain.pairs import explain_pair
-from ssh_abduction.rivals.assumed import assumptions
-from ssh_abduction.rivals.page import html
-from ssh_abduction.rivals.page.content import DRAWN, content_of
-from ssh_abduction.rivals.page.html import Page
-from ssh_abduction.rivals.page.images import ALPHABET, LOST, beams_of, drawn_images
-from ssh_abduction.rivals.page.server import PageServer
+from ssh_abduction.page import html
+from ssh_abduction.page.assumed import assumptions
+from ssh_abduction.page.content import DRAWN, content_of
+from ssh_abduction.page.html import Page
+from ssh_abduction.page.images import ALPHABET, LOST, beams_of, drawn_images
+from ssh_abduction.page.server import PageServer
 from ssh_abduction.solver.asp.process import _under_way
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -134,7 +134,7 @@ def test_images_of_a_sidecar_file_and_panoramas_are_shown(tmp_path: Path, monkey
     assert (drawn["kind"], drawn["rows"], drawn["columns"]) == ("panorama", 2, 3)
     assert drawn["images"][1][0] == ALPHABET[0]
     assert drawn["images"][0][0] > drawn["images"][1][0]
-    monkeypatch.setattr("ssh_abduction.rivals.page.images.MOST", 1)
+    monkeypatch.setattr("ssh_abduction.page.images.MOST", 1)
     with pytest.warns(UserWarning, match="2 images are more than a page holds"):
         assert drawn_images(trace) is None
     (tmp_path / "images.npz").unlink()
@@ -302,7 +302,7 @@ def test_a_length_that_is_none_is_refused(server: PageServer, length: str) -> No
 
 def test_question_whose_asker_is_gone_is_given_up(server: PageServer, monkeypatch: pytest.MonkeyPatch) -> None:
     own = server.url.partition(str(server.port))[2]
-    monkeypatch.setattr("ssh_abduction.rivals.page.answers.solved", sleep)
+    monkeypatch.setattr("ssh_abduction.page.answers.solved", sleep)
     with socket.create_connection(("127.0.0.1", server.port)) as connection:
         connection.sendall(
             f"POST {own}solve HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{{}}".encode()

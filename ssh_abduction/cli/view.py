@@ -12,8 +12,8 @@ from ssh_abduction.data.errors import MapError, SSHError, brief, is_whole, named
 
 if TYPE_CHECKING:
     from ssh_abduction.data.trace import Trace
+    from ssh_abduction.page.content import Called, Run
     from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.rivals.page.content import Called, Run
     from ssh_abduction.theory.theory import Theory
 
 
@@ -46,9 +46,9 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.data.maps import read_json
     from ssh_abduction.data.trace import Trace
+    from ssh_abduction.page.content import Called, content_of  # which loads numpy
+    from ssh_abduction.page.html import Page
     from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.rivals.page.content import Called, content_of  # which loads numpy
-    from ssh_abduction.rivals.page.html import Page
     from ssh_abduction.theory.theory import Theory
 
     if options.serve and options.trace is None:
@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
     """What the page knows without a server of what assumptions cost: texts, and by pairs of steps the number of the text for one dstate, and for different ones."""
-    from ssh_abduction.rivals.assumed import assumptions
+    from ssh_abduction.page.assumed import assumptions
 
     try:
         known = assumptions(listing, trace, theory, ASSUMING)
@@ -99,7 +99,7 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
     """The run that is localised, if one was asked for. Raises SSHError."""
     from ssh_abduction.data.trace import Trace
-    from ssh_abduction.rivals.page.content import Run
+    from ssh_abduction.page.content import Run
 
     if options.localize is None and options.belief is None:
         return None
@@ -116,7 +116,7 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
 def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     """The run with the beliefs in a file. Raises MapError."""
     from ssh_abduction.data.maps import maps_of, read_json
-    from ssh_abduction.rivals.page.content import Run
+    from ssh_abduction.page.content import Run
 
     told = read_json(file)
     beliefs = told.get("beliefs") if isinstance(told, dict) else None
@@ -149,7 +149,7 @@ def _serve(
     import signal
 
     from ssh_abduction.data import program
-    from ssh_abduction.rivals.page.server import PageServer
+    from ssh_abduction.page.server import PageServer
     from ssh_abduction.solver.asp.process import end_all
 
     try:

@@ -24,10 +24,10 @@ from typing import Any
 
 from ssh_abduction.data.errors import MapError, SSHError, brief, is_whole
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.page import answers
+from ssh_abduction.page.content import Called, Run, content_of
+from ssh_abduction.page.html import html_of
 from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.rivals.page import answers
-from ssh_abduction.rivals.page.content import Called, Run, content_of
-from ssh_abduction.rivals.page.html import html_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.asp.process import in_process
 from ssh_abduction.theory.theory import Theory

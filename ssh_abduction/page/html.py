@@ -16,8 +16,8 @@ from ssh_abduction.data.checks import a_function
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap, write_map
 from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.page.content import Run, content_of
 from ssh_abduction.rivals.listing import Maps
-from ssh_abduction.rivals.page.content import Run, content_of
 
 HERE = FilePath(__file__).parent
 ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
@@ -43,7 +43,7 @@ class Page:
 
     def widget(self) -> Any:
         """The page as a widget of notebooks. Raises MapError where anywidget is not installed."""
-        from ssh_abduction.rivals.page.widget import widget_of
+        from ssh_abduction.page.widget import widget_of
 
         return widget_of(self.html)
 

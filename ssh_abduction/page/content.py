@@ -20,9 +20,9 @@ from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.output.layout import Layout, layout
 from ssh_abduction.output.metric_picture import axes
+from ssh_abduction.page.images import drawn_images
 from ssh_abduction.rivals.compare import compare
 from ssh_abduction.rivals.listing import Listing, Maps
-from ssh_abduction.rivals.page.images import drawn_images
 
 Steps: TypeAlias = tuple[int, ...]
 Spot: TypeAlias = tuple[float, float, float | None]
