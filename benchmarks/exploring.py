@@ -8,7 +8,7 @@ Runs are paired: all begin in the same world and at the same dstate. A robot *ha
 theory has places; and if it has done every travel. Maps that differ in paths alone count as one. For the walks this is sought in the trace afterwards: from the step on at which everything was visited, after
 ever more steps, and then by halving. The explorer also says itself when it is done.
 
-    explorer       Explorer of ssh_abduction/explorer.py
+    explorer       Explorer of ssh_abduction/online/explorer.py
     random         any action that the robot can do, evenly
     rule           mazes: looks around at each place, then follows the wall to its right. Plans: the drive of simulator/plans.py, through the door that was passed least often, which knows where the robot is
     hW             AALpy's learner without resets. Its oracle knows the truth and costs nothing but the steps of a shortest counterexample, and so does an action that cannot be done: so hW is better here than
@@ -38,7 +38,7 @@ from truth import Known, is_true, share_all
 from simulator.plans import Floor, Plan
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.trace import Action, Step
-from ssh_abduction.explorer import Explorer
+from ssh_abduction.online.explorer import Explorer
 from ssh_abduction.rivals.tour import Move, shortest_flow
 
 ROOT = Path(__file__).parent.parent

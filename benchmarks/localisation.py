@@ -34,7 +34,7 @@ from simulator.world import World
 from ssh_abduction import Belief, Localiser, SSHMap, Step, Trace
 from ssh_abduction.data.maps import DState
 from ssh_abduction.evaluation.paper.figures import draw_beliefs
-from ssh_abduction.localize import Verdict
+from ssh_abduction.online.localize import Verdict
 
 FAMILIES: dict[str, Callable[[int], Walk]] = {
     "machines of 20 states, 6 views": lambda seed: moore(20, 6, steps=1000, seed=seed),

@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from ssh_abduction.data.trace import Action, Step, Trace
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, VisitsEvaluation, evaluate, evaluate_visits
     from ssh_abduction.evaluation.ladder import Rung, ladder
-    from ssh_abduction.explorer import Exploration, Explorer
-    from ssh_abduction.localize import Belief, Chances, Localiser
+    from ssh_abduction.online.explorer import Exploration, Explorer
+    from ssh_abduction.online.localize import Belief, Chances, Localiser
     from ssh_abduction.online.mapper import OnlineMapper
+    from ssh_abduction.online.routes import Move, Route, route
     from ssh_abduction.output.export.formats import export_map
     from ssh_abduction.page.html import Page, view_page
     from ssh_abduction.rivals.compare import Comparison, compare
     from ssh_abduction.rivals.difference import Difference, difference
     from ssh_abduction.rivals.explore import Experiment, next_experiment
     from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.routes import Move, Route, route
     from ssh_abduction.solver.engines.base import Cost
     from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
     from ssh_abduction.solver.search import Search, solve
@@ -40,8 +40,8 @@ _HOMES = {  # module: the names that it exports
     "data.errors": ("LocaliserError", "MapError", "RangeError", "SSHError", "SolverError", "TheoryError", "TraceError"),
     "evaluation": ("Evaluation", "MapEvaluation", "VisitsEvaluation", "evaluate", "evaluate_visits"),
     "output.export.formats": ("export_map",),
-    "explorer": ("Exploration", "Explorer"),
-    "localize": ("Belief", "Chances", "Localiser"),
+    "online.explorer": ("Exploration", "Explorer"),
+    "online.localize": ("Belief", "Chances", "Localiser"),
     "data.maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
     "data.odometry": ("Odometry",),
     "online.mapper": ("OnlineMapper",),
@@ -50,7 +50,7 @@ _HOMES = {  # module: the names that it exports
     "rivals.listing": ("Listing",),
     "page.html": ("Page", "view_page"),
     "rivals.explore": ("Experiment", "next_experiment"),
-    "routes": ("Move", "Route", "route"),
+    "online.routes": ("Move", "Route", "route"),
     "evaluation.ladder": ("Rung", "ladder"),
     "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
     "solver.search": ("Search", "solve"),

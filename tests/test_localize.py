@@ -25,7 +25,7 @@ from perception.store import save
 from ssh_abduction import Belief, Chances, Localiser, LocaliserError, MapError, SSHMap, Step, Theory, Trace, TraceError, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data.maps import DState
-from ssh_abduction.localize import COLLAPSED, Verdict
+from ssh_abduction.online.localize import COLLAPSED, Verdict
 
 Array = np.ndarray[Any, Any]
 

@@ -18,7 +18,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.sharing import stretches
 
 if TYPE_CHECKING:
-    from ssh_abduction.localize import Localiser
+    from ssh_abduction.online.localize import Localiser
 
 HEAD = ("step", "action", "seen", "", "dstate", "probability", "nowhere", "entropy", "normaliser")
 CHANCES = ("misread", "slipped", "unmapped", "reentered")
@@ -75,7 +75,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _localiser(options: argparse.Namespace) -> Localiser:
     """The localiser that the options ask for. Raises SSHError that names the file that is wrong."""
-    from ssh_abduction.localize import Chances, Localiser
+    from ssh_abduction.online.localize import Chances, Localiser
 
     maps = maps_of(read_maps(options.maps), str(options.maps))
     if not maps:

@@ -28,8 +28,8 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    from ssh_abduction.online.routes import route, told_action  # which loads networkx
     from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.routes import route, told_action  # which loads networkx
 
     listing = Listing.load(options.maps)
     try:

@@ -107,7 +107,7 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
     if followed is None:
         raise SSHError("--belief: expected the run that it is of, got none; name it with --localize, or give the trace that was mapped")
     if options.belief is None:
-        from ssh_abduction.localize import Localiser
+        from ssh_abduction.online.localize import Localiser
 
         return Run(followed, lambda ssh_map: Localiser(ssh_map).beliefs(followed))
     return _with_beliefs(followed, options.belief, data)
