@@ -23,14 +23,15 @@ from perception.places.track import Track, follow
 from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
 from simulator.rounds import record_plan
-from ssh_abduction import SSHError, Theory, log_maps
+from ssh_abduction import SSHError, Theory
 from ssh_abduction.cli import batch, main
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.odometry import between
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
-from ssh_abduction.log_maps import SPEED, map_log, seconds_left
+from ssh_abduction.robot_logs import maps as log_maps
+from ssh_abduction.robot_logs.maps import SPEED, map_log, seconds_left
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.result import Solution, Status
 

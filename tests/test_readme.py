@@ -19,10 +19,10 @@ from pathlib import Path
 import figures
 import pytest
 
-from ssh_abduction import log_maps
 from ssh_abduction.cli import main, parser
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.picture import svg
+from ssh_abduction.robot_logs import maps as log_maps
 from ssh_abduction.solver.result import Status
 from ssh_abduction.solver.search import solve
 from ssh_abduction.theory.rules import Rules
