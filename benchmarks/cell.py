@@ -29,11 +29,13 @@ from peers import PEERS, Machine, NotApplicableError
 from suite import INSTANCES
 from table import OURS, WITHOUT
 
-from ssh_abduction import Search, Solution, Speedups, Theory, Trace
+from ssh_abduction import Solution, Theory, Trace
 from ssh_abduction.checker.checker import check
+from ssh_abduction.solver import Search
 from ssh_abduction.solver.asp import limits
 from ssh_abduction.solver.asp.limits import peak_memory
 from ssh_abduction.solver.result import Status
+from ssh_abduction.theory import Speedups
 
 AROUND = 300  # seconds for all that the clock does not count
 MARGIN = 0.1  # how much later than its own limit a solver of ours is ended: time to hand over what it has

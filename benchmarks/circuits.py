@@ -10,7 +10,8 @@ from __future__ import annotations
 import statistics
 import time
 
-from ssh_abduction import Speedups, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.theory import Speedups
 
 AT_ONCE = 48  # steps that are still quickly solved without prefixes
 

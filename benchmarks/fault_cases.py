@@ -19,7 +19,8 @@ from instances import Walk, faulty_machine, maze
 from suite import taylor_hall
 from truth import partition
 
-from ssh_abduction import Odometry, Theory, Trace
+from ssh_abduction import Theory, Trace
+from ssh_abduction.data import Odometry
 
 PRICE = 1.5  # What a fault of any kind costs, in dstates.
 MARGIN = 5  # No fault is at one of so many first or last steps: it could not be noticed there.

@@ -20,7 +20,8 @@ from truth import NOISE
 
 import ssh_abduction.checker.geometry
 import ssh_abduction.solver.fit
-from ssh_abduction import Odometry, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.data import Odometry
 from ssh_abduction.solver.result import Status
 from ssh_abduction.theory.evidence import displacement
 

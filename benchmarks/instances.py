@@ -16,7 +16,8 @@ from itertools import pairwise
 import numpy as np
 
 from simulator.motion import Pose, between, reported
-from ssh_abduction import Odometry, Trace
+from ssh_abduction import Trace
+from ssh_abduction.data import Odometry
 
 HEADINGS = ((0, 1), (1, 0), (0, -1), (-1, 0))  # north, east, south, west
 TURNS = {"right": 1, "around": 2, "left": 3}

@@ -31,9 +31,11 @@ from perception.likelihood import ImageLikelihood
 from perception.recognition import recogniser
 from simulator.tours import simulate
 from simulator.world import World
-from ssh_abduction import Belief, Localiser, SSHMap, Step, Trace
+from ssh_abduction import Localiser, SSHMap, Trace
+from ssh_abduction.data import Step
 from ssh_abduction.data.maps import DState
 from ssh_abduction.evaluation.paper.figures import draw_beliefs
+from ssh_abduction.online import Belief
 from ssh_abduction.online.localize import Verdict
 
 FAMILIES: dict[str, Callable[[int], Walk]] = {

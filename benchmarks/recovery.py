@@ -25,8 +25,9 @@ from typing import Any
 from fault_cases import CAUSAL, MARGIN, TOPOLOGICAL, Case, is_true, rectangle_of_five, sized, star_turned
 from instances import Walk
 
-from ssh_abduction import Cost, OnlineMapper, SSHMap, Theory, Trace
+from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace
 from ssh_abduction.online.rivals import Rival
+from ssh_abduction.solver import Cost
 from ssh_abduction.solver.asp import facts
 
 COLUMNS = (

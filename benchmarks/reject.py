@@ -15,8 +15,9 @@ from dataclasses import replace
 import numpy as np
 from instances import Walk, maze
 
-from ssh_abduction import DState, Odometry, SSHMap, Theory
+from ssh_abduction import SSHMap, Theory
 from ssh_abduction.checker.geometry import refused_returns
+from ssh_abduction.data import DState, Odometry
 
 REJECTS = (0.5, 0.2, 0.05, 0.01, 0.001)
 MODEL = Odometry()

@@ -28,9 +28,11 @@ from instances import displaced, maze
 from simulator.motion import Pose
 from simulator.plans import Plan, tour
 from simulator.robot import Body
-from ssh_abduction import Odometry, Solution, Status, Theory, Trace, solve
+from ssh_abduction import Solution, Theory, Trace, solve
+from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import NUMBERS
+from ssh_abduction.solver import Status
 
 ROOT = Path(__file__).parent.parent
 # What the noise is unless a flag says otherwise: 5 % along the way, 0.5 % across it, and 0.002 rad of heading in a metre.

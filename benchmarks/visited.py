@@ -23,7 +23,8 @@ from scipy.ndimage import label
 from skeleton import poses_of
 
 from perception.readers.logs import read_log
-from ssh_abduction import Action, DState, SSHMap, Step, Trace
+from ssh_abduction import SSHMap, Trace
+from ssh_abduction.data import Action, DState, Step
 from ssh_abduction.evaluation import Evaluation, Relations, VisitsEvaluation, evaluate, evaluate_visits, told_poses
 from ssh_abduction.evaluation.visits import NEAR
 

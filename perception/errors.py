@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.errors import AbductionError
 
 
-class PerceptionError(SSHError, ValueError):
+class PerceptionError(AbductionError, ValueError):
     """Images, labels, settings or a stored recogniser are not what was asked for. A ValueError too, as scikit-learn expects."""
 
 
-class LogError(SSHError, ValueError):
+class LogError(AbductionError, ValueError):
     """A robot's log, or what it holds, cannot be read or written. The text says what was expected, what came, and how to mend it."""
 
 

@@ -1,9 +1,9 @@
 """Errors of the simulator."""
 
-from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.errors import AbductionError
 
 
-class SimulatorError(SSHError, ValueError):
+class SimulatorError(AbductionError, ValueError):
     """A world, a pose or a tour that cannot be simulated. The text says what was expected, what came, and how to mend it."""
 
 

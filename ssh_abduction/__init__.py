@@ -1,117 +1,107 @@
 """From what a robot saw and did, find the map: every minimal topological map of distinctive states, places and paths.
 
-A name is loaded when it is first used: so the command line begins at once, and hears Ctrl-C from then on. Nothing is imported before
-`__main__` has put the current folder behind Python's own modules, not even `__future__`.
+Each name is loaded when it is first used. The command line therefore starts at once and hears Ctrl-C from then on.
+This module imports nothing, not even `__future__`, before `__main__` has put the current folder behind Python's own modules.
 """
 
-TYPE_CHECKING = False  # as in typing, which takes longer to load than all that is here
+TYPE_CHECKING = False  # as in typing, which takes longer to load than this whole module
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
     from typing import Any
 
-    from ssh_abduction.data.errors import LocaliserError, MapError, RangeError, SolverError, SSHError, TheoryError, TraceError
-    from ssh_abduction.data.maps import DState, Fit, Path, Pose, SSHMap
-    from ssh_abduction.data.odometry import Odometry
-    from ssh_abduction.data.trace import Action, Step, Trace
-    from ssh_abduction.evaluation import Evaluation, MapEvaluation, VisitsEvaluation, evaluate, evaluate_visits
-    from ssh_abduction.evaluation.ladder import Rung, ladder
-    from ssh_abduction.online.explorer import Exploration, Explorer
-    from ssh_abduction.online.localize import Belief, Chances, Localiser
-    from ssh_abduction.online.mapper import OnlineMapper
-    from ssh_abduction.online.routes import Move, Route, route
-    from ssh_abduction.output.export.formats import export_map
-    from ssh_abduction.page.html import Page, view_page
-    from ssh_abduction.rivals.compare import Comparison, compare
-    from ssh_abduction.rivals.difference import Difference, difference
-    from ssh_abduction.rivals.explore import Experiment, next_experiment
-    from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.solver.engines.base import Cost
-    from ssh_abduction.solver.result import Bound, Level, Progress, Solution, Status
-    from ssh_abduction.solver.search import Search, solve
-    from ssh_abduction.solver.sharing import Backbone
-    from ssh_abduction.solver.steps.certificate import Certificate
-    from ssh_abduction.theory.speedups import Speedups
-    from ssh_abduction.theory.theory import Theory
+    from ssh_abduction.checker import check
+    from ssh_abduction.data import AbductionError, SSHMap, Trace
+    from ssh_abduction.evaluation import evaluate
+    from ssh_abduction.explain import explain_pair, explain_trace
+    from ssh_abduction.learning import BootstrapLearner
+    from ssh_abduction.online import Explorer, Localiser, OnlineMapper, route
+    from ssh_abduction.output import export_map
+    from ssh_abduction.page import view_page
+    from ssh_abduction.rivals import comparison as compare
+    from ssh_abduction.rivals import next_experiment
+    from ssh_abduction.robot_logs import map_log
+    from ssh_abduction.solver import Solution, solve
+    from ssh_abduction.theory import Theory
 
     __version__: str
 
-_HOMES = {  # module: the names that it exports
-    "solver.engines.base": ("Cost",),
-    "data.errors": ("LocaliserError", "MapError", "RangeError", "SSHError", "SolverError", "TheoryError", "TraceError"),
-    "evaluation": ("Evaluation", "MapEvaluation", "VisitsEvaluation", "evaluate", "evaluate_visits"),
-    "output.export.formats": ("export_map",),
-    "online.explorer": ("Exploration", "Explorer"),
-    "online.localize": ("Belief", "Chances", "Localiser"),
-    "data.maps": ("DState", "Fit", "Path", "Pose", "SSHMap"),
-    "data.odometry": ("Odometry",),
-    "online.mapper": ("OnlineMapper",),
-    "rivals.compare": ("Comparison", "compare"),
-    "rivals.difference": ("Difference", "difference"),
-    "rivals.listing": ("Listing",),
-    "page.html": ("Page", "view_page"),
-    "rivals.explore": ("Experiment", "next_experiment"),
-    "online.routes": ("Move", "Route", "route"),
-    "evaluation.ladder": ("Rung", "ladder"),
-    "solver.result": ("Bound", "Level", "Progress", "Solution", "Status"),
-    "solver.search": ("Search", "solve"),
-    "solver.sharing": ("Backbone",),
-    "solver.steps.certificate": ("Certificate",),
-    "theory.speedups": ("Speedups",),
-    "theory.theory": ("Theory",),
-    "data.trace": ("Action", "Step", "Trace"),
+_HOMES = {  # package: the names that are exported from it
+    "checker": ("check",),
+    "data": ("AbductionError", "SSHMap", "Trace"),
+    "evaluation": ("evaluate",),
+    "explain": ("explain_pair", "explain_trace"),
+    "learning": ("BootstrapLearner",),
+    "online": ("Explorer", "Localiser", "OnlineMapper", "route"),
+    "output": ("export_map",),
+    "page": ("view_page",),
+    "rivals": ("compare", "next_experiment"),
+    "robot_logs": ("map_log",),
+    "solver": ("Solution", "solve"),
+    "theory": ("Theory",),
+}
+
+# Names of version 0.1.0: each still works in this version, with a warning that says where it is now.
+_MOVED = {
+    "Action": "data.Action",
+    "Backbone": "solver.Backbone",
+    "Belief": "online.Belief",
+    "Bound": "solver.Bound",
+    "Certificate": "solver.Certificate",
+    "Chances": "online.Chances",
+    "Comparison": "rivals.Comparison",
+    "Cost": "solver.Cost",
+    "DState": "data.DState",
+    "Difference": "rivals.Difference",
+    "Evaluation": "evaluation.Evaluation",
+    "Experiment": "rivals.Experiment",
+    "Exploration": "online.Exploration",
+    "Fit": "data.Fit",
+    "Level": "solver.Level",
+    "Listing": "rivals.Listing",
+    "LocaliserError": "data.LocaliserError",
+    "MapError": "data.MapError",
+    "MapEvaluation": "evaluation.MapEvaluation",
+    "Move": "online.Move",
+    "Odometry": "data.Odometry",
+    "Page": "page.Page",
+    "Path": "data.MapPath",
+    "Pose": "data.Pose",
+    "Progress": "solver.Progress",
+    "RangeError": "data.RangeError",
+    "Route": "online.Route",
+    "Rung": "evaluation.ladder.Rung",
+    "SSHError": "data.AbductionError",
+    "Search": "solver.Search",
+    "SolverError": "data.SolverError",
+    "Speedups": "theory.Speedups",
+    "Status": "solver.Status",
+    "Step": "data.Step",
+    "TheoryError": "data.TheoryError",
+    "TraceError": "data.TraceError",
+    "VisitsEvaluation": "evaluation.VisitsEvaluation",
+    "difference": "rivals.difference",
+    "evaluate_visits": "evaluation.evaluate_visits",
+    "ladder": "evaluation.ladder.ladder",
 }
 
 __all__ = [
-    "Action",
-    "Backbone",
-    "Belief",
-    "Bound",
-    "Certificate",
-    "Chances",
-    "Comparison",
-    "Cost",
-    "DState",
-    "Difference",
-    "Evaluation",
-    "Experiment",
-    "Exploration",
+    "AbductionError",
+    "BootstrapLearner",
     "Explorer",
-    "Fit",
-    "Level",
-    "Listing",
     "Localiser",
-    "LocaliserError",
-    "MapError",
-    "MapEvaluation",
-    "Move",
-    "Odometry",
     "OnlineMapper",
-    "Page",
-    "Path",
-    "Pose",
-    "Progress",
-    "RangeError",
-    "Route",
-    "Rung",
-    "SSHError",
     "SSHMap",
-    "Search",
     "Solution",
-    "SolverError",
-    "Speedups",
-    "Status",
-    "Step",
     "Theory",
-    "TheoryError",
     "Trace",
-    "TraceError",
-    "VisitsEvaluation",
+    "check",
     "compare",
-    "difference",
     "evaluate",
-    "evaluate_visits",
+    "explain_pair",
+    "explain_trace",
     "export_map",
-    "ladder",
+    "map_log",
     "next_experiment",
     "route",
     "solve",
@@ -119,21 +109,51 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> "Any":
-    import importlib
+def lazy_names(
+    package: str, homes: "Mapping[str, Sequence[str]]", exported: "Sequence[str]"
+) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
+    """Make the `__getattr__` and `__dir__` of a package that loads each name when it is first used.
 
+    Args:
+        package: The package's `__name__`.
+        homes: For each module of the package, the names to take from it.
+        exported: All names that the package exports.
+    """
+    import sys
+
+    where = {name: module for module, names in homes.items() for name in names}
+
+    def load(name: str) -> "Any":
+        from importlib import import_module
+
+        if name not in where:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        module = f"{package}.{where[name]}"
+        loaded = import_module(module)
+        value = getattr(loaded, name) if hasattr(loaded, name) else import_module(f"{module}.{name}")
+        setattr(sys.modules[package], name, value)
+        return value
+
+    def names() -> "list[str]":
+        return sorted({*vars(sys.modules[package]), *exported})
+
+    return load, names
+
+
+_load, __dir__ = lazy_names(__name__, _HOMES, [*__all__, "__version__"])
+
+
+def __getattr__(name: str) -> "Any":
     if name == "__version__":
         from importlib.metadata import version
 
         globals()[name] = version("ssh-abduction")
         return globals()[name]
-    for module, names in _HOMES.items():
-        if name in names:
-            value = getattr(importlib.import_module(f"{__name__}.{module}"), name)
-            globals()[name] = value
-            return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in _MOVED:
+        import warnings
+        from importlib import import_module
 
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, "__version__"})
+        package, _, now = _MOVED[name].rpartition(".")
+        warnings.warn(f"ssh_abduction.{name} is deprecated; use ssh_abduction.{package}.{now}", DeprecationWarning, stacklevel=2)
+        return getattr(import_module(f"{__name__}.{package}"), now)
+    return _load(name)

@@ -17,10 +17,12 @@ from strategies import TOYS, theories, traces
 from worlds import HEADINGS, QUARTERS, TWO_BLOCKS, Streets, drive, rectangle
 
 from benchmarks.instances import maze
-from ssh_abduction import Odometry, OnlineMapper, Search, Status, Theory, Trace, difference, solve
+from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.cli import main
+from ssh_abduction.data import Odometry
 from ssh_abduction.data.words import counted
-from ssh_abduction.solver import prefixes
+from ssh_abduction.rivals import difference
+from ssh_abduction.solver import Search, Status, prefixes
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.framed import FramedEngine

@@ -22,11 +22,12 @@ import pytest
 from distributed import Client, LocalCluster
 from worlds import TOURS, drive, rectangle
 
-from ssh_abduction import Speedups, Theory, Trace
+from ssh_abduction import Theory, Trace
 from ssh_abduction.cli import batch, main, mapping
 from ssh_abduction.cli.batch import Absence, Answer, Question, Stop
 from ssh_abduction.cli.mapping import MapAnswer, MapQuestion
 from ssh_abduction.solver.asp import workers
+from ssh_abduction.theory import Speedups
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ENDLESS = ["--boundary", "none", "--path-order", "partial", "--prefer", "", "-n", "0"]  # a theory in which slow.jsonl has maps without end

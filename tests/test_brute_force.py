@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from brute_force import consistent_maps, key, minimal_maps
 
-from ssh_abduction.data.maps import DState, Path, SSHMap
+from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Trace
 from ssh_abduction.theory.theory import Theory
 
@@ -137,5 +137,5 @@ def test_every_map_is_listed_once(theory: Theory) -> None:
 
 def test_key_numbers_by_first_visit() -> None:
     dstates = (DState(0, "b", 5, 8, -1), DState(1, "a", 9, 8, -1), DState(2, "c", 5, None, None), DState(3, "d", 9, 8, 1))
-    ssh_map = SSHMap((1, 0, 2, 3), dstates, (), (5, 9), (Path(8, (5, 9)),))
+    ssh_map = SSHMap((1, 0, 2, 3), dstates, (), (5, 9), (MapPath(8, (5, 9)),))
     assert key(ssh_map) == ((0, 1, 2, 3), (0, 1, 1, 0), ((0, 1), (0, 1), None, (0, -1)))

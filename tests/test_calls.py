@@ -27,31 +27,27 @@ from simulator.plans import Door, Plan, Room
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import (
-    Action,
-    Chances,
+    AbductionError,
     Explorer,
-    Level,
-    Listing,
     Localiser,
-    Odometry,
     OnlineMapper,
-    Search,
-    Speedups,
-    SSHError,
-    Step,
     Theory,
     Trace,
     compare,
-    difference,
     evaluate,
-    evaluate_visits,
-    ladder,
     next_experiment,
     route,
     solve,
     view_page,
 )
+from ssh_abduction.data import Action, Odometry, Step
+from ssh_abduction.evaluation import evaluate_visits
+from ssh_abduction.evaluation.ladder import ladder
 from ssh_abduction.learning.learner import BootstrapLearner
+from ssh_abduction.online import Chances
+from ssh_abduction.rivals import Listing, difference
+from ssh_abduction.solver import Level, Search
+from ssh_abduction.theory import Speedups
 
 SHIPPED = Path(inspect.getfile(World)).parent / "worlds" / "notched-rectangle.json"
 
@@ -453,7 +449,7 @@ def test_wrong_arguments_are_refused_by_errors_of_the_package(call: str, functio
             try:
                 with contextlib.redirect_stderr(io.StringIO()):
                     do(call, function, {**right, parameter.name: make()})
-            except SSHError as error:
+            except AbductionError as error:
                 if name in RIGHT.get(key, ()):
                     wrong.append(f"{key} = {name}: expected to be accepted, got {error}")
             except Exception as error:

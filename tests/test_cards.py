@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 from worlds import rectangle
 
-from ssh_abduction import DState, SSHMap, Theory, Trace, solve
+from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction.data import DState
 from ssh_abduction.data.cards import ROWS
 from ssh_abduction.data.maps import DRAWN
 from ssh_abduction.solver.search import Search

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssh_abduction.checker.checker import AXIOMS, COHERENCE, Violation, check
-from ssh_abduction.data.maps import DState, Path, SSHMap
+from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import Theory
@@ -53,7 +53,7 @@ def chart(trace: Trace, labels: str, states: str, orders: str = "", excused: tup
             )
         )
     places = tuple(range(1 + max((s.place for s in dstates if s.place is not None), default=-1)))
-    paths = tuple(Path(i, () if word == "-" else tuple(map(int, word))) for i, word in enumerate(orders.split()))
+    paths = tuple(MapPath(i, () if word == "-" else tuple(map(int, word))) for i, word in enumerate(orders.split()))
     return SSHMap(steps, tuple(dstates), links(trace, steps), places, paths, excused)
 
 
@@ -301,17 +301,17 @@ MUTATIONS = {
     "a link dropped": (ONCE, replace(ONCE.map, links=ONCE.map.links[1:]), COHERENCE),
     "a link twice": (ONCE, replace(ONCE.map, links=(*ONCE.map.links, ONCE.map.links[0])), COHERENCE),
     "a link made up": (ONCE, replace(ONCE.map, links=(*ONCE.map.links, (0, "travel", 1))), COHERENCE),
-    "an order turned": (ONCE, replace(ONCE.map, paths=(Path(0, (0, 3)), *ONCE.map.paths[1:])), "travel_orders"),
-    "an order lists a place twice": (ONCE, replace(ONCE.map, paths=(Path(0, (3, 0, 3)), *ONCE.map.paths[1:])), COHERENCE),
-    "an order lists no place": (ONCE, replace(ONCE.map, paths=(Path(0, ()), *ONCE.map.paths[1:])), "on_path"),
-    "an order lists None": (ONCE, replace(ONCE.map, paths=(Path(0, (3, None, 0)), *ONCE.map.paths[1:])), COHERENCE),
-    "an order lists an unknown place": (ONCE, replace(ONCE.map, paths=(Path(0, (3, 0, 9)), *ONCE.map.paths[1:])), COHERENCE),
+    "an order turned": (ONCE, replace(ONCE.map, paths=(MapPath(0, (0, 3)), *ONCE.map.paths[1:])), "travel_orders"),
+    "an order lists a place twice": (ONCE, replace(ONCE.map, paths=(MapPath(0, (3, 0, 3)), *ONCE.map.paths[1:])), COHERENCE),
+    "an order lists no place": (ONCE, replace(ONCE.map, paths=(MapPath(0, ()), *ONCE.map.paths[1:])), "on_path"),
+    "an order lists None": (ONCE, replace(ONCE.map, paths=(MapPath(0, (3, None, 0)), *ONCE.map.paths[1:])), COHERENCE),
+    "an order lists an unknown place": (ONCE, replace(ONCE.map, paths=(MapPath(0, (3, 0, 9)), *ONCE.map.paths[1:])), COHERENCE),
     "places merged": (ONCE, change(change(ONCE.map, 4, place=0), 5, place=0), "path_between_sides"),
     "a place not used": (ONCE, replace(ONCE.map, places=(0, 1, 2, 3, 4)), COHERENCE),
     "a place not listed": (ONCE, replace(ONCE.map, places=(0, 1, 2)), COHERENCE),
     "no place": (ONCE, change(ONCE.map, 4, place=None), "one_place"),
     "a place out of range": (ONCE, change(ONCE.map, 4, place=9), COHERENCE),
-    "a path not used": (ONCE, replace(ONCE.map, paths=(*ONCE.map.paths, Path(4, ()))), COHERENCE),
+    "a path not used": (ONCE, replace(ONCE.map, paths=(*ONCE.map.paths, MapPath(4, ()))), COHERENCE),
     "a path not listed": (ONCE, replace(ONCE.map, paths=ONCE.map.paths[:-1]), COHERENCE),
     "a path twice": (ONCE, replace(ONCE.map, paths=(*ONCE.map.paths, ONCE.map.paths[0])), COHERENCE),
     "a path out of range": (ONCE, change(ONCE.map, 4, path=9), COHERENCE),
@@ -334,7 +334,7 @@ MUTATIONS = {
     "headings from another slot": (FRAMED, change(change(FRAMED.map, 0, heading=1), 3, heading=3), COHERENCE),
     "places numbered otherwise": (
         FRAMED,
-        replace(FRAMED.map, dstates=tuple(replace(s, place=1 - s.place) for s in FRAMED.map.dstates), paths=(Path(0, (1, 0)),)),
+        replace(FRAMED.map, dstates=tuple(replace(s, place=1 - s.place) for s in FRAMED.map.dstates), paths=(MapPath(0, (1, 0)),)),
         COHERENCE,
     ),
     "places at the causal level": (CAUSAL, replace(CAUSAL.map, places=(0,)), COHERENCE),
@@ -392,7 +392,7 @@ def mutants(draw: st.DrawFn) -> tuple[Case, SSHMap]:
             m = replace(m, labels=(*m.labels[:i], draw(NUMBERS), *m.labels[i + 1 :]))
         elif part == "order" and m.paths:
             i = draw(st.integers(0, len(m.paths) - 1))
-            m = replace(m, paths=(*m.paths[:i], Path(draw(NUMBERS), tuple(draw(st.lists(NUMBERS, max_size=4)))), *m.paths[i + 1 :]))
+            m = replace(m, paths=(*m.paths[:i], MapPath(draw(NUMBERS), tuple(draw(st.lists(NUMBERS, max_size=4)))), *m.paths[i + 1 :]))
         elif part == "excused":
             m = replace(m, excused=tuple(draw(st.lists(st.tuples(NUMBERS, NUMBERS), max_size=2))))
         elif part not in ("label", "order") and getattr(m, part):
@@ -467,7 +467,7 @@ def listings(trace, labels, views, places, courses) -> Iterator[SSHMap]:
         if s.path is not None:
             on.setdefault(s.path, set()).add(s.place)
     for orders in product(*(permutations(sorted(on[h])) for h in sorted(on))):
-        paths = tuple(Path(h, order) for h, order in enumerate(orders))
+        paths = tuple(MapPath(h, order) for h, order in enumerate(orders))
         yield SSHMap(labels, dstates, links(trace, labels), tuple(range(max(places) + 1)), paths)
 
 
@@ -494,6 +494,6 @@ def test_a_long_trace_is_checked_in_its_stride() -> None:
     corridor = Trace.from_steps(["v"] * long, ["travel"] * (long - 1))
     steps = tuple(range(long))
     states = tuple(DState(i, "v", i, 0, 1) for i in steps)
-    whole = SSHMap(steps, states, links(corridor, steps), steps, (Path(0, steps),))
+    whole = SSHMap(steps, states, links(corridor, steps), steps, (MapPath(0, steps),))
     for order in ("partial", "total"):
         assert check(corridor, whole, TOPOLOGICAL.replace(next_place=True, path_order=order)) == ()

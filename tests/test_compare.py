@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import cache
 from itertools import combinations, product
 from math import prod
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import clingo
 import numpy as np
@@ -24,12 +24,14 @@ from strategies import theories, traces
 from worlds import rectangle, written
 
 from benchmarks.instances import maze
-from ssh_abduction import Comparison, Listing, MapError, SSHMap, Theory, Trace, compare, difference, solve
+from ssh_abduction import SSHMap, Theory, Trace, compare, solve
 from ssh_abduction.cli import main
 from ssh_abduction.cli import solve as solving
 from ssh_abduction.cli.text import compared
-from ssh_abduction.data.maps import DState, Fault, Fit, Path
-from ssh_abduction.rivals.compare import Matter, Question
+from ssh_abduction.data import MapError
+from ssh_abduction.data.maps import DState, Fault, Fit, MapPath
+from ssh_abduction.rivals import Comparison, Listing, difference
+from ssh_abduction.rivals.comparison import Matter, Question
 from ssh_abduction.rivals.factors import deciding, independent
 from ssh_abduction.rivals.table import Table
 from ssh_abduction.solver import search as searching
@@ -235,7 +237,7 @@ def of_streets(rng: random.Random, count: int, dstates: int, steps: int) -> list
             for i in range(dstates)
         )
         places = tuple(sorted({s.place for s in states if s.place is not None}))
-        paths = tuple(Path(h, ()) for h in sorted({s.path for s in states if s.path is not None}))
+        paths = tuple(MapPath(h, ()) for h in sorted({s.path for s in states if s.path is not None}))
         maps.append(SSHMap(labels, states, (), places, paths).renumbered())
     return maps
 
@@ -268,7 +270,7 @@ def test_ids_do_not_depend_on_how_things_are_numbered(seed: int) -> None:
             labels=tuple(number[label] for label in ssh_map.labels),
             dstates=tuple(sorted(states, key=lambda s: s.id)),
             links=tuple((number[s], action, number[x]) for s, action, x in ssh_map.links),
-            paths=tuple(Path(path[p.id], tuple(place[q] for q in p.order[:: way[p.id]])) for p in ssh_map.paths),
+            paths=tuple(MapPath(path[p.id], tuple(place[q] for q in p.order[:: way[p.id]])) for p in ssh_map.paths),
         )
         assert other.id == ssh_map.id
         assert compare([ssh_map], [other]).others is not None
@@ -350,10 +352,10 @@ def printed_by(*words: str) -> str:
 
 
 @pytest.fixture
-def file_of(tmp_path: FilePath) -> Callable[..., FilePath]:
+def file_of(tmp_path: Path) -> Callable[..., Path]:
     """A file of what `solve --json` prints."""
 
-    def written_by(*words: str, name: str = "maps.json") -> FilePath:
+    def written_by(*words: str, name: str = "maps.json") -> Path:
         path = tmp_path / name
         path.write_text(printed_by(*words))
         return path
@@ -361,7 +363,7 @@ def file_of(tmp_path: FilePath) -> Callable[..., FilePath]:
     return written_by
 
 
-def test_the_shell_prints_what_python_says(file_of: Callable[..., FilePath], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_shell_prints_what_python_says(file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
     path = file_of(ACES3, "-n", "0")
     solution = solve(Trace.load(ACES3), maps=0)
     found = compare(solution)
@@ -380,7 +382,7 @@ def test_the_shell_prints_what_python_says(file_of: Callable[..., FilePath], cap
 
 
 def test_where_not_all_are_listed_the_backbone_says_what_all_share(
-    file_of: Callable[..., FilePath], capsys: pytest.CaptureFixture[str]
+    file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     cut, every = file_of(ACES3, "-n", "2", name="cut.json"), file_of(ACES3, "-n", "0")
     assert main(["compare", str(cut), str(every)]) == 0
@@ -423,7 +425,7 @@ def test_causal_maps_and_maps_with_faults() -> None:
     assert any(line.startswith("faults: only in the first map the ") for line in difference(one, other).lines)
 
 
-def test_larger_maps_are_told_from_minimal_ones(file_of: Callable[..., FilePath], capsys: pytest.CaptureFixture[str]) -> None:
+def test_larger_maps_are_told_from_minimal_ones(file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
     path = file_of(ACES3, "-n", "0", "--within", "3")
     assert main(["compare", str(path)]) == 0
     printed = capsys.readouterr().out
@@ -431,7 +433,7 @@ def test_larger_maps_are_told_from_minimal_ones(file_of: Callable[..., FilePath]
     assert "  4 maps with 19 dstates, " in printed
 
 
-def edited(path: FilePath, change: Callable[[dict[str, object]], object]) -> FilePath:
+def edited(path: Path, change: Callable[[dict[str, object]], object]) -> Path:
     data = json.loads(path.read_text())
     change(data)
     path.write_text(json.dumps(data))
@@ -457,7 +459,7 @@ def edited(path: FilePath, change: Callable[[dict[str, object]], object]) -> Fil
     ],
 )
 def test_files_that_are_not_what_they_should_be(
-    file_of: Callable[..., FilePath], capsys: pytest.CaptureFixture[str], change: Callable[[dict[str, object]], object], message: str
+    file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str], change: Callable[[dict[str, object]], object], message: str
 ) -> None:
     assert main(["compare", str(edited(file_of(ACES3, "-n", "0"), change))]) == 1
     error = capsys.readouterr().err
@@ -465,7 +467,7 @@ def test_files_that_are_not_what_they_should_be(
     assert error.count("\n") == 1
 
 
-def test_maps_of_other_traces_are_refused(file_of: Callable[..., FilePath], capsys: pytest.CaptureFixture[str], tmp_path: FilePath) -> None:
+def test_maps_of_other_traces_are_refused(file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = file_of(ACES3, "-n", "0")
     rectangle(22).save(tmp_path / "other.jsonl")
     rectangle(9).save(tmp_path / "short.jsonl")
@@ -507,7 +509,7 @@ def test_the_backbone_survives_files_also_where_pairs_are_left_out() -> None:
         assert again.sorts[sort].always == shared.always
 
 
-def test_json_streams_what_is_too_much_to_hold(monkeypatch: pytest.MonkeyPatch, file_of: Callable[..., FilePath]) -> None:
+def test_json_streams_what_is_too_much_to_hold(monkeypatch: pytest.MonkeyPatch, file_of: Callable[..., Path]) -> None:
     held = json.loads(file_of(ACES3, "-n", "0").read_text())
     printed_by.cache_clear()
     monkeypatch.setattr(solving, "HELD", 2)

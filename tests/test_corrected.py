@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import STARS
 
-from ssh_abduction import Search, Speedups, Theory, Trace
+from ssh_abduction import Theory, Trace
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.trace import Action
-from ssh_abduction.solver import mending, search
+from ssh_abduction.solver import Search, mending, search
+from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 PLAIN = Speedups.without(SPEEDUPS)

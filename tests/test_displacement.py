@@ -16,8 +16,9 @@ from scipy.optimize import approx_fprime
 from strategies import theories, traces
 from test_property import agree
 
-from ssh_abduction import DState, Odometry, SSHMap, Theory, TheoryError, Trace, solve
+from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.data import DState, Odometry, TheoryError
 from ssh_abduction.solver.asp.facts import causal_map
 from ssh_abduction.solver.fit import _Problem, fit
 from ssh_abduction.solver.ranking import noise_warning, units_warning

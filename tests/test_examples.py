@@ -13,8 +13,9 @@ from typing import Any
 
 import pytest
 
-from ssh_abduction import Status, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.solver import Status
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -12,11 +12,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
 
-from ssh_abduction import Status, Theory, Trace, TraceError, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.cli import main
+from ssh_abduction.data import TraceError
 from ssh_abduction.explain.derivation import Derivation
 from ssh_abduction.explain.no_map import Axioms, Piece
 from ssh_abduction.explain.pairs import PairExplanation, Verdict, explain_pair, explain_trace
+from ssh_abduction.solver import Status
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.theory.encodings import axioms
 

@@ -13,10 +13,12 @@ import pytest
 from brute_geometry import Geometry
 from test_displacement import WHITE, circuit
 
-from ssh_abduction import Odometry, Status, Theory, Trace, TraceError, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
+from ssh_abduction.data import Odometry, TraceError
 from ssh_abduction.explain.no_map import explain, why_apart
+from ssh_abduction.solver import Status
 from ssh_abduction.theory.evidence import evidence_of, pairs_of
 from ssh_abduction.theory.pairs import pairs_in
 

@@ -10,8 +10,11 @@ from typing import Any
 import pytest
 from worlds import HEADINGS, TEE, Streets, streets
 
-from ssh_abduction import Action, Exploration, Explorer, Status, Step, Theory, TheoryError, TraceError, solve
-from ssh_abduction.data.errors import SSHError
+from ssh_abduction import Explorer, Theory, solve
+from ssh_abduction.data import Action, Step, TheoryError, TraceError
+from ssh_abduction.data.errors import AbductionError
+from ssh_abduction.online import Exploration
+from ssh_abduction.solver import Status
 
 TURNS = {"right": 1, "around": 2, "left": 3}
 CORRIDOR = streets(("a", "E", "b"), ("b", "E", "c"))
@@ -181,14 +184,14 @@ class Nothing(Machine):
     [
         (lambda robot: Explorer(robot, margin=-1), TraceError, "margin: expected a number of dstates, 0 or more, got -1"),
         (lambda robot: Explorer(robot, margin=float("nan")), TraceError, "margin: expected a number of dstates"),
-        (lambda robot: Explorer(robot, limit=float("nan")), SSHError, "limit"),
+        (lambda robot: Explorer(robot, limit=float("nan")), AbductionError, "limit"),
         (lambda robot: Explorer(robot, Theory.causal().replace(misread=1)), TheoryError, "theory: expected one without faults"),
         (lambda robot: Explorer(Nothing("a", {0: {}})), TraceError, "look: expected a Step with a view, got None"),
         (lambda robot: Explorer(robot).explore(-1), TraceError, "steps: expected a number of actions, 0 or more, got -1"),
         (lambda robot: Explorer(robot).explore(2.5), TraceError, "steps: expected a number of actions"),
     ],
 )
-def test_bad_input_is_refused(build: Any, error: type[SSHError], message: str) -> None:
+def test_bad_input_is_refused(build: Any, error: type[AbductionError], message: str) -> None:
     with pytest.raises(error, match=message):
         build(Machine("a", {0: {}}))
 

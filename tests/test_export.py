@@ -13,9 +13,10 @@ import pytest
 import yaml
 from worlds import rectangle
 
-from ssh_abduction import MapError, SSHMap, Theory, Trace, export_map, solve
+from ssh_abduction import SSHMap, Theory, Trace, export_map, solve
 from ssh_abduction.cli import export as verb
 from ssh_abduction.cli import main
+from ssh_abduction.data import MapError
 from ssh_abduction.data.maps import DState
 from ssh_abduction.output.export import formats
 from ssh_abduction.output.export.roads import TURN, Road, Roads, Stop

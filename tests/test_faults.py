@@ -18,17 +18,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import faulty_machine
 
-from ssh_abduction import Speedups, Status, Step, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
+from ssh_abduction.data import Step
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import Fault, SSHMap
-from ssh_abduction.solver import search
+from ssh_abduction.solver import Status, search
 from ssh_abduction.solver.engines import faulty
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.blocks import Blocks
 from ssh_abduction.solver.front import fault_front
 from ssh_abduction.solver.guesses.robust import Explainer
+from ssh_abduction.theory import Speedups
 
 Told = tuple[tuple[int, ...], frozenset[tuple[int, str, object]]]  # the labels of the steps, and the faults
 

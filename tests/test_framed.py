@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from instances import Walk, maze
 from strategies import STARS
 
-from ssh_abduction import OnlineMapper, Search, Speedups, Status, Theory, Trace, solve
+from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, Watch
@@ -37,7 +38,7 @@ from ssh_abduction.solver.guesses.merging import kept, merged_near
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.steps.chart import QUARTERS, Chart, FramedChart, numbered
 from ssh_abduction.solver.steps.log import Log
-from ssh_abduction.theory import encodings
+from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 PLAIN = Speedups.without(SPEEDUPS)

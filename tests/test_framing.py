@@ -12,15 +12,16 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import theories, traces
 
-from ssh_abduction import OnlineMapper, Search, Speedups, SSHMap, Status, Theory, Trace, solve
+from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver import candidates, prefixes
+from ssh_abduction.solver import Search, Status, candidates, prefixes
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
 from ssh_abduction.solver.engines import framing
 from ssh_abduction.solver.engines.framing import maps_with_frames
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.speedups import SPEEDUPS, row
 
 THEORIES = {

@@ -16,14 +16,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from planar import drive
 
-from ssh_abduction import OnlineMapper, Status, Theory, Trace, TraceError, solve
+from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker import gateways as judge
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
+from ssh_abduction.data import TraceError
 from ssh_abduction.data.maps import maps_of, read_json
 from ssh_abduction.data.star import Frame, Gateway, Star
 from ssh_abduction.data.trace import Action, Step
-from ssh_abduction.solver import prefixes
+from ssh_abduction.solver import Status, prefixes
 from ssh_abduction.solver.steps import frames
 from ssh_abduction.theory.speedups import Speedups
 

@@ -12,14 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import maze
 
-from ssh_abduction import Odometry, OnlineMapper, Speedups, SSHMap, Theory, Trace, solve
+from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.data import Odometry
 from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.odometry import in_words
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.solver.front import fault_front
 from ssh_abduction.solver.guesses.jumps import wrong_displacements
+from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 AHEAD, LEFT, AWAY = (10.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2), (25.0, 7.0, 0.9)

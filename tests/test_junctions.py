@@ -24,10 +24,11 @@ from simulator.robot import Body, Robot
 from simulator.surroundings import Panorama, Place, compass
 from simulator.tours import simulate
 from simulator.world import World
-from ssh_abduction import Status, Trace, solve
+from ssh_abduction import Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.evaluation import evaluate
+from ssh_abduction.solver import Status
 
 SHIPPED = {"triangle": (12, 3, 3), "three-ways": (16, 5, 4), "five-ways": (20, 6, 5), "six-ways": (18, 7, 3)}
 FIVE = World.named("five-ways")

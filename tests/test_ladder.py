@@ -10,8 +10,9 @@ from unittest.mock import patch
 import pytest
 import truth
 
-from ssh_abduction import Odometry, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.cli import main
+from ssh_abduction.data import Odometry
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder
 
 SQUARE = Trace.from_steps("ab" * 4 + "a", ["travel", "right"] * 4, displacements=[(10, 0, 0), (0, 0, -1.5708)] * 4)

@@ -8,14 +8,15 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import combinations, pairwise
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import networkx as nx
 import numpy as np
 import pytest
 from worlds import COMB, HEADINGS, PLUS, SQUARE, TEE, TOURS, TWO_BLOCKS, Streets, drive, streets
 
-from ssh_abduction import DState, MapError, Path, SSHMap, Theory, Trace, solve
+from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction.data import DState, MapError, MapPath
 from ssh_abduction.data.maps import Fault, Fit, Pose
 from ssh_abduction.output.layout import Layout, layout
 
@@ -47,7 +48,7 @@ def mapped(edges: Streets) -> SSHMap:
         for name, k in (("right", 1), ("left", 3))
     ]
     travels = [(i, "travel", number[edges[p][h], h]) for (p, h), i in number.items() if h in edges[p]]
-    paths = tuple(Path(i, tuple(ids[p] for p in line)) for i, line in enumerate(lines))
+    paths = tuple(MapPath(i, tuple(ids[p] for p in line)) for i, line in enumerate(lines))
     return SSHMap(tuple(range(len(faced))), dstates, (*turns, *travels), tuple(ids.values()), paths)
 
 
@@ -144,7 +145,7 @@ def test_angles_may_be_any() -> None:
     """A triangle that the robot drives round, turning right by 120 degrees; then a map whose places know the degrees."""
     dstates = tuple(DState(i, f"v{i}", (i + 1) // 2 % 3, i // 2, 1) for i in range(6))
     links = tuple((i, "travel" if i % 2 == 0 else "turn", (i + 1) % 6) for i in range(6))
-    triangle = SSHMap(tuple(range(6)), dstates, links, (0, 1, 2), tuple(Path(i, (i, (i + 1) % 3)) for i in range(3)))
+    triangle = SSHMap(tuple(range(6)), dstates, links, (0, 1, 2), tuple(MapPath(i, (i, (i + 1) % 3)) for i in range(3)))
     found = layout(triangle, {"turn": 120})
     check(triangle, found, {"turn": 120})
     sides = [math.dist(*pair) for pair in combinations(found.places.values(), 2)]
@@ -161,7 +162,7 @@ def test_streets_that_no_straight_path_holds_are_straight_one_by_one() -> None:
     north, south = (next(path for path in square.paths if path.id == square.dstates[4 * place + 1].path) for place in (0, 3))
     dstates = tuple(replace(s, path=north.id) if s.path == south.id else s for s in square.dstates)
     others = tuple(path for path in square.paths if path not in (north, south))
-    ssh_map = replace(square, dstates=dstates, paths=(Path(north.id, north.order + south.order), *others))
+    ssh_map = replace(square, dstates=dstates, paths=(MapPath(north.id, north.order + south.order), *others))
     found = layout(ssh_map)
     corners = {tuple(round(x) for x in spot) for spot in found.places.values()}
     assert len(corners) == 4
@@ -185,7 +186,7 @@ def test_parts_that_nothing_connects_are_side_by_side() -> None:
     square = mapped(SQUARE)
     far = [replace(s, id=s.id + 16, place=(s.place or 0) + 4, path=(s.path or 0) + 4) for s in square.dstates]
     links = [(s + 16, action, x + 16) for s, action, x in square.links]
-    paths = [Path(p.id + 4, tuple(q + 4 for q in p.order)) for p in square.paths]
+    paths = [MapPath(p.id + 4, tuple(q + 4 for q in p.order)) for p in square.paths]
     both = replace(
         square, dstates=(*square.dstates, *far), links=(*square.links, *links), places=tuple(range(8)), paths=(*square.paths, *paths)
     )
@@ -263,7 +264,7 @@ def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_table_has_a_row_for_each_step() -> None:
     pytest.importorskip("pandas")
-    trace = Trace.load(FilePath(__file__).parent.parent / "examples" / "notched-rectangle.jsonl").prefix(20)
+    trace = Trace.load(Path(__file__).parent.parent / "examples" / "notched-rectangle.jsonl").prefix(20)
     (ssh_map,) = solve(trace).maps
     table = ssh_map.to_pandas()
     assert list(table["dstate"]) == list(ssh_map.labels)

@@ -30,9 +30,10 @@ from perception.views import ViewClusterer
 from simulator.laser import BEARINGS, Laser
 from simulator.tours import simulate
 from simulator.world import World
-from ssh_abduction import Step, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
+from ssh_abduction.data import Step
 from ssh_abduction.data.errors import TraceError
 from ssh_abduction.evaluation.paper.claims import EXPERIMENTS, Run, claims, measure, one_to_one, outcome, rate, summary, true_dstates
 from ssh_abduction.learning import learner as learner_module

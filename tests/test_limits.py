@@ -17,9 +17,10 @@ import pytest
 from limits import Case, cases, outcome
 from worlds import rectangle
 
-from ssh_abduction import Search, Status, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.explain.no_map import Axioms, Interrupted, Piece
+from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory

@@ -10,8 +10,9 @@ from unittest.mock import patch
 import pytest
 
 from benchmarks.instances import Walk, maze
-from ssh_abduction import Search, Theory, solve
+from ssh_abduction import Theory, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.solver import Search
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines import paths as paths_module
 from ssh_abduction.solver.engines import visits as same

@@ -22,9 +22,11 @@ from perception.errors import PerceptionError
 from perception.likelihood import ImageLikelihood
 from perception.recognition import PlaceRecognizer, recogniser
 from perception.store import save
-from ssh_abduction import Belief, Chances, Localiser, LocaliserError, MapError, SSHMap, Step, Theory, Trace, TraceError, solve
+from ssh_abduction import Localiser, SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
+from ssh_abduction.data import LocaliserError, MapError, Step, TraceError
 from ssh_abduction.data.maps import DState
+from ssh_abduction.online import Belief, Chances
 from ssh_abduction.online.localize import COLLAPSED, Verdict
 
 Array = np.ndarray[Any, Any]

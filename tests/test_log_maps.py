@@ -23,7 +23,7 @@ from perception.places.track import Track, follow
 from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
 from simulator.rounds import record_plan
-from ssh_abduction import SSHError, Theory
+from ssh_abduction import AbductionError, Theory
 from ssh_abduction.cli import batch, main
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.simulate import scans_of
@@ -159,7 +159,7 @@ def test_flags_are_laid_over_the_theory_that_suits_the_walls(
     trace = replace(Trace.from_steps("ab", ["travel"]), extra={"right_angles": False})
 
     def solve(_: log_maps.LogMapping, __: Trace, theory: Theory, **___: object) -> None:
-        raise SSHError(f"star={theory.star}, boundary={theory.boundary}")
+        raise AbductionError(f"star={theory.star}, boundary={theory.boundary}")
 
     monkeypatch.setattr(
         log_maps, "import_log", lambda *_: SimpleNamespace(trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={}, notes=())

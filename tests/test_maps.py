@@ -10,7 +10,8 @@ import networkx as nx
 import pytest
 from worlds import SQUARE, TEE, TOURS, Streets, drive, rectangle, streets, written
 
-from ssh_abduction import MapError, SSHMap, Theory, solve
+from ssh_abduction import SSHMap, Theory, solve
+from ssh_abduction.data import MapError
 from ssh_abduction.output.picture import svg
 
 SVG = "{http://www.w3.org/2000/svg}"

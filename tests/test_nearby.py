@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from instances import maze, moore
 from test_speedups import PLAIN, machines
 
-from ssh_abduction import Speedups, Status, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.solver import Status
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, Watch
@@ -31,6 +32,7 @@ from ssh_abduction.solver.guesses.annealing import annealed
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory import Speedups
 
 CAUSAL = Theory.causal()
 

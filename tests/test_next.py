@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from instances import maze, moore, rectangle
 
-from ssh_abduction import DState, MapError, SolverError, SSHMap, Theory, Trace, next_experiment, solve
-from ssh_abduction import Path as MapPath
+from ssh_abduction import SSHMap, Theory, Trace, next_experiment, solve
 from ssh_abduction.cli import main
+from ssh_abduction.data import DState, MapError, MapPath, SolverError
 from ssh_abduction.rivals.consequences import Consequences
 from ssh_abduction.rivals.explore import Experiment, Plan
 from ssh_abduction.rivals.machines import Seen, links_of

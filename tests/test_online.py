@@ -20,10 +20,12 @@ from instances import maze
 from strategies import FOREIGN, PAIRS, theories, traces
 from worlds import TOURS, drive, rectangle
 
-from ssh_abduction import Action, Odometry, OnlineMapper, Solution, SSHMap, Status, Step, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.data import Action, Odometry, Step, TheoryError, TraceError
 from ssh_abduction.online import background as guessing
 from ssh_abduction.online import mapper as online
+from ssh_abduction.solver import Status
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.guesses.tree import Sketch

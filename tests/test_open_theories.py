@@ -18,19 +18,20 @@ from instances import maze
 from strategies import TOYS, Toy, traces
 from worlds import ACTIONS
 
-from ssh_abduction import OnlineMapper, Search, Speedups, SSHMap, Status, Theory, TheoryError, Trace, solve
+from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker import check
 from ssh_abduction.checker.checker import unchecked
 from ssh_abduction.cli import main
+from ssh_abduction.data import TheoryError
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.online import mapper as mapper_module
-from ssh_abduction.solver import judging, prefixes, search
+from ssh_abduction.solver import Search, Status, judging, prefixes, search
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.frameless import FramelessEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import InternalError
-from ssh_abduction.theory import encodings
+from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.speedups import SPEEDUPS, TABLE, row

@@ -20,25 +20,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssh_abduction import (
-    Action,
-    DState,
-    Listing,
-    Localiser,
-    MapError,
-    Solution,
-    SSHMap,
-    Step,
-    Theory,
-    Trace,
-    TraceError,
-    solve,
-    view_page,
-)
+from ssh_abduction import Localiser, Solution, SSHMap, Theory, Trace, solve, view_page
 from ssh_abduction.cli import main
 from ssh_abduction.cli.options import add_theory, flags_of, theory_of
-from ssh_abduction.data.maps import Fault, Fit, Pose
-from ssh_abduction.data.maps import Path as MapPath
+from ssh_abduction.data import Action, DState, MapError, Step, TraceError
+from ssh_abduction.data.maps import Fault, Fit, MapPath, Pose
 from ssh_abduction.explain.pairs import explain_pair
 from ssh_abduction.page import html
 from ssh_abduction.page.assumed import assumptions
@@ -46,6 +32,7 @@ from ssh_abduction.page.content import DRAWN, content_of
 from ssh_abduction.page.html import Page
 from ssh_abduction.page.images import ALPHABET, LOST, beams_of, drawn_images
 from ssh_abduction.page.server import PageServer
+from ssh_abduction.rivals import Listing
 from ssh_abduction.solver.asp.process import _under_way
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

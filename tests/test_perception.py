@@ -37,7 +37,7 @@ from perception.quality import cluster_quality, cluster_spread, spanning_tree, t
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecognizer, learning_curve, recogniser
 from perception.views import ViewClusterer, as_view_clusterer
-from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.errors import AbductionError
 
 Images = np.ndarray[Any, Any]
 
@@ -99,7 +99,7 @@ def test_images_of_unequal_length_are_named(estimator: Any) -> None:
 
 
 def test_errors_of_perception_are_the_packages() -> None:
-    assert issubclass(PerceptionError, SSHError)
+    assert issubclass(PerceptionError, AbductionError)
 
 
 # M

@@ -16,8 +16,7 @@ from worlds import TOURS, drive
 
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
-from ssh_abduction.data.maps import DState, Fit, Pose
-from ssh_abduction.data.maps import Path as Street
+from ssh_abduction.data.maps import DState, Fit, MapPath, Pose
 from ssh_abduction.output.picture import svg
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -41,8 +40,8 @@ def grid(side: int, apart: float = 8.0) -> SSHMap:
             path = y if quarter % 2 == 0 else side + x
             dstates.append(DState(len(dstates), f"view {len(dstates)}", place, path, 1 if quarter < 2 else -1))
             poses.append(Pose(*at, math.remainder(quarter * math.pi / 2, math.tau), (0.01 * x, 0.002 * (x - y), 0.02 * y)))
-    rows = [Street(y, tuple(y * side + x for x in range(side))) for y in range(side)]
-    columns = [Street(side + x, tuple(y * side + x for y in range(side))) for x in range(side)]
+    rows = [MapPath(y, tuple(y * side + x for x in range(side))) for y in range(side)]
+    columns = [MapPath(side + x, tuple(y * side + x for y in range(side))) for x in range(side)]
     east = [(4 * p, "travel", 4 * p + 4) for p in range(side * side) if p % side < side - 1]
     return SSHMap((0,), tuple(dstates), tuple(east), tuple(range(side * side)), (*rows, *columns), fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))
 

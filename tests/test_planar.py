@@ -17,11 +17,11 @@ from instances import maze
 from map_trees import DIRECTIONS, Cells, Joined, lattice, levels, passes_no_place_twice, stars_on
 from worlds import ACTIONS, HEADINGS, QUARTERS, drive, streets
 
-from ssh_abduction import OnlineMapper, Solution, SSHMap, Status, Theory, Trace, solve
+from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker import check
 from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.data.maps import DState
-from ssh_abduction.solver import prefixes, search
+from ssh_abduction.solver import Status, prefixes, search
 from ssh_abduction.theory.evidence import Equality, Planar
 from ssh_abduction.theory.planarity import can_be_drawn, is_planar
 

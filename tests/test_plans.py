@@ -12,10 +12,10 @@ import pytest
 from simulator.errors import SimulatorError
 from simulator.motion import moved
 from simulator.plans import APART, STRAIGHT, Plan, tour
-from ssh_abduction import Odometry, Theory, Trace, evaluate, solve
+from ssh_abduction import Theory, Trace, evaluate, solve
 from ssh_abduction.checker.checker import check, turned
-from ssh_abduction.data.maps import DState, SSHMap
-from ssh_abduction.data.maps import Path as Course
+from ssh_abduction.data import Odometry
+from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Step
 
 PLANS = Path(__file__).parent.parent.parent / "shared" / "data" / "plans"
@@ -83,7 +83,7 @@ def true_map(plan: Plan, trace: Trace) -> SSHMap:
         last = set(plan.doors[legs[-1][1]].rooms) - {legs[-1][0]}
         rooms = [numbers["place"].get(f"room {room}") for room in (*(room for room, _ in legs), *last)]
         seen = {dstate.place for dstate in dstates if dstate.path == number}
-        courses.append(Course(number, tuple(place for place in rooms if place is not None and place in seen)))
+        courses.append(MapPath(number, tuple(place for place in rooms if place is not None and place in seen)))
     return SSHMap(labels, tuple(dstates), tuple(links), tuple(numbers["place"].values()), tuple(courses)).renumbered()
 
 

@@ -17,7 +17,7 @@ from unittest.mock import patch
 import pytest
 from aces import ACES
 
-from ssh_abduction import Solution, SSHError, Theory, Trace
+from ssh_abduction import AbductionError, Solution, Theory, Trace
 from ssh_abduction.cli import main
 from ssh_abduction.data import program
 from ssh_abduction.evaluation.ladder import UnderWay
@@ -100,7 +100,7 @@ def test_where_modules_are_looked_for(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir(tmp_path)
     with patch.object(sys, "path", ["", "/other", str(tmp_path), "/lib"]):
         assert program.search_path() == ["/other", "/lib", "", str(tmp_path)]
-    monkeypatch.chdir(Path(program.__file__).parents[1])  # as in a checkout
+    monkeypatch.chdir(Path(program.__file__).parents[2])  # as in a checkout
     with patch.object(sys, "path", ["", "/lib"]):
         assert program.search_path() == ["", "/lib"]
 
@@ -216,7 +216,7 @@ def test_work_in_processes_gives_results_in_order_and_raises_what_it_raises() ->
     with pytest.raises(ZeroDivisionError):
         next(found)
     assert list(report._each(divmod, [(9, 4)], 2)) == [(2, 1)]
-    with pytest.raises(SSHError, match="expected an answer, got killed"):
+    with pytest.raises(AbductionError, match="expected an answer, got killed"):
         list(report._each(os._exit, [(0,), (0,)], 2))
 
 

@@ -17,9 +17,11 @@ from test_solver import wandering
 from test_speedups import machines
 from worlds import rectangle
 
-from ssh_abduction import MapError, OnlineMapper, Search, Theory, Trace, solve
+from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli import main
+from ssh_abduction.data import MapError
+from ssh_abduction.solver import Search
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.steps.log import Log
 

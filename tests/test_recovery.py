@@ -14,12 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_faults import cheapest, small_traces, told
 
-from ssh_abduction import Belief, OnlineMapper, Solution, Speedups, Status, Theory, TheoryError, Trace, TraceError, solve
+from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.online import recovery
+from ssh_abduction.data import TheoryError, TraceError
+from ssh_abduction.online import Belief, recovery
 from ssh_abduction.online.meanwhile import Meanwhile
 from ssh_abduction.online.rivals import Rival, Scale
+from ssh_abduction.solver import Status
 from ssh_abduction.solver.asp.process import _under_way
+from ssh_abduction.theory import Speedups
 
 NO_TIME = 1e-9  # seconds: every search is stopped before it begins
 BOTH = Theory.causal().replace(misread=1.5, slipped=3)

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import traces
 
-from ssh_abduction import DState, Odometry, SSHMap, Theory, Trace
+from ssh_abduction import SSHMap, Theory, Trace
 from ssh_abduction.checker import geometry
 from ssh_abduction.checker.geometry import refused_returns
+from ssh_abduction.data import DState, Odometry
 from ssh_abduction.theory.evidence import displacement as module
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns
 from ssh_abduction.theory.evidence.loops import Loops, Reckoning, chi_squares

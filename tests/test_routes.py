@@ -9,9 +9,10 @@ from itertools import product
 import pytest
 from worlds import rectangle
 
-from ssh_abduction import MapError, SSHMap, Theory, Trace, route, solve
+from ssh_abduction import SSHMap, Theory, Trace, route, solve
 from ssh_abduction.cli import main
-from ssh_abduction.data.maps import DState, Fit, Path, Pose
+from ssh_abduction.data import MapError
+from ssh_abduction.data.maps import DState, Fit, MapPath, Pose
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +76,7 @@ def test_a_route_by_places_leads_back_along_a_street_that_was_driven_one_way(squ
 def test_what_is_avoided_is_gone_round() -> None:
     dstates = tuple(DState(i, "v", i) for i in range(4))
     links = ((0, "a", 1), (1, "a", 3), (0, "b", 2), (2, "b", 0), (2, "c", 2), (2, "a", 1))
-    ssh_map = SSHMap((0, 1, 2, 3), dstates, links, (0, 1, 2, 3), (Path(0, (0, 1)),))
+    ssh_map = SSHMap((0, 1, 2, 3), dstates, links, (0, 1, 2, 3), (MapPath(0, (0, 1)),))
     assert route(ssh_map, 0, 1).dstates == (0, 1)
     assert route(ssh_map, 0, 1).goal == "dstate 1"
     assert route(ssh_map, 0, 3).dstates == (0, 1, 3)
@@ -83,7 +84,7 @@ def test_what_is_avoided_is_gone_round() -> None:
         route(ssh_map, 0, 3, avoid=[1])
     with pytest.raises(MapError, match="those of to"):
         route(ssh_map, 0, 3, avoid=["p3"])
-    detour = SSHMap(ssh_map.labels, dstates, (*links, (2, "d", 3)), (0, 1, 2, 3), (Path(0, (0, 1)),))
+    detour = SSHMap(ssh_map.labels, dstates, (*links, (2, "d", 3)), (0, 1, 2, 3), (MapPath(0, (0, 1)),))
     assert route(detour, 0, 3, avoid=["p1"]).actions == ("b", "d")
 
 

@@ -21,7 +21,8 @@ from simulator.robot import Body, Robot
 from simulator.sight import LONG, sight
 from simulator.tours import noise_model, simulate
 from simulator.world import World
-from ssh_abduction import Odometry, Trace
+from ssh_abduction import Trace
+from ssh_abduction.data import Odometry
 
 RECTANGLE = World.named("notched-rectangle")
 HALL = World.named("taylor-hall")

@@ -25,25 +25,13 @@ from strategies import theories, traces
 from worlds import TOURS, drive, rectangle, written
 
 from benchmarks.instances import maze
-from ssh_abduction import (
-    OnlineMapper,
-    Progress,
-    Search,
-    SolverError,
-    Speedups,
-    SSHMap,
-    Status,
-    Theory,
-    TheoryError,
-    Trace,
-    TraceError,
-    solve,
-)
+from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data import SolverError, TheoryError, TraceError
+from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.explain.no_map import Interrupted, explain
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.solver import prefixes
+from ssh_abduction.solver import Progress, Search, Status, prefixes
 from ssh_abduction.solver import search as solver_module
 from ssh_abduction.solver.asp.facts import links_of
 from ssh_abduction.solver.engines import base as engine_module
@@ -52,6 +40,7 @@ from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.steps.log import Log, Outcome
+from ssh_abduction.theory import Speedups
 
 TRACE = rectangle(8)
 MAP = solve(TRACE).maps[0]
@@ -145,7 +134,7 @@ def test_arguments_of_another_kind(arguments: tuple[Any, ...], message: str) -> 
         lambda *rest: check(rest[0], MAP, *rest[1:]),
         lambda *rest: BootstrapLearner(*rest[1:]).fit(rest[0]),
     ):
-        with pytest.raises(SSHError, match=re.escape(message)):
+        with pytest.raises(AbductionError, match=re.escape(message)):
             function(*arguments)
 
 
@@ -167,7 +156,7 @@ def test_arguments_of_another_kind(arguments: tuple[Any, ...], message: str) -> 
     ],
 )
 def test_arguments_of_another_kind_are_errors_of_the_package(call: Callable[[], Any], message: str) -> None:
-    with pytest.raises(SSHError, match=re.escape(message)):
+    with pytest.raises(AbductionError, match=re.escape(message)):
         call()
 
 
@@ -304,7 +293,8 @@ def test_a_stream_that_is_left_does_not_abort_python() -> None:
     """It still has a search of clingo's, in a thread, when Python ends."""
     program = textwrap.dedent("""
         import sys
-        from ssh_abduction import Search, Trace
+        from ssh_abduction import Trace
+        from ssh_abduction.solver import Search
         maps = iter(Search(Trace.load(sys.argv[1]).without_stars(), maps=1))
         print(len(next(maps).labels))
     """)

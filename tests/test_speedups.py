@@ -19,8 +19,10 @@ from hypothesis import strategies as st
 from instances import maze, moore
 from strategies import traces
 
-from ssh_abduction import Search, SolverError, Speedups, Status, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.data import SolverError
+from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError
@@ -34,6 +36,7 @@ from ssh_abduction.solver.guesses.merging import merged, thinned
 from ssh_abduction.solver.steps.apart import Continuations, clique
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory import Speedups
 
 NAMES = [f.name for f in fields(Speedups)]
 PLAIN = Speedups.without(NAMES)

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from worlds import TOURS, drive, rectangle, written
 
-from ssh_abduction import Status, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.solver import Status
 
 P0 = Theory.causal()
 P1 = Theory(boundary="none", path_order="partial", star="none", prefer=("paths", "places", "dstates"))

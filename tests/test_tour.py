@@ -8,7 +8,8 @@ import pytest
 from test_explorer import RING, TURNS, Streetwalker
 from worlds import HEADINGS, Streets, streets
 
-from ssh_abduction import Action, Explorer, Theory, Trace, solve
+from ssh_abduction import Explorer, Theory, Trace, solve
+from ssh_abduction.data import Action
 from ssh_abduction.rivals.tour import _doubted, next_tour
 
 ENDS = [(1, 0, 0, 0), (0, 0, 1, 0)]

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssh_abduction import Action, Step, Trace, TraceError
+from ssh_abduction import Trace
+from ssh_abduction.data import Action, Step, TraceError
 from ssh_abduction.data import trace as trace_module
 from ssh_abduction.data.odometry import Odometry
 

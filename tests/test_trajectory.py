@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from ssh_abduction import DState, SSHMap, Trace, TraceError, evaluate_visits
+from ssh_abduction import SSHMap, Trace
 from ssh_abduction.cli import main
+from ssh_abduction.data import DState, TraceError
 from ssh_abduction.data.trace import Action, Step
-from ssh_abduction.evaluation import Trajectory, TrajectoryWarning, told_poses
+from ssh_abduction.evaluation import Trajectory, TrajectoryWarning, evaluate_visits, told_poses
 
 HEAD = "# timestamp tx ty tz qx qy qz qw\n"
 # There and back along 20 m: steps 0 and 4 are at one place, and so are 1 and 3.

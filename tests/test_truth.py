@@ -13,7 +13,8 @@ import truth
 from instances import CELL, maze
 
 from simulator.motion import moved
-from ssh_abduction import Odometry, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.data import Odometry
 
 EXACT = Odometry(0, 0, 0, 0, 0, 0, 0, 0)
 NOISE = Odometry(**truth.NOISE)

@@ -17,7 +17,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import TraceError
-from ssh_abduction.rivals.compare import compare
+from ssh_abduction.rivals.comparison import compare
 from ssh_abduction.rivals.explore import next_experiment
 from ssh_abduction.theory.speedups import TABLE
 

@@ -15,27 +15,12 @@ from worlds import TOURS, drive, rectangle
 import ssh_abduction
 from simulator.errors import SimulatorError
 from simulator.world import World
-from ssh_abduction import (
-    Certificate,
-    Localiser,
-    MapError,
-    OnlineMapper,
-    RangeError,
-    Search,
-    Solution,
-    Speedups,
-    SSHError,
-    SSHMap,
-    Status,
-    Theory,
-    Trace,
-    TraceError,
-    evaluate,
-    solve,
-)
-from ssh_abduction.data import maps
+from ssh_abduction import AbductionError, Localiser, OnlineMapper, Solution, SSHMap, Theory, Trace, evaluate, solve
+from ssh_abduction.data import MapError, RangeError, TraceError, maps
 from ssh_abduction.learning.labels import LearnerError
+from ssh_abduction.solver import Certificate, Search, Status
 from ssh_abduction.solver.judging import InternalError
+from ssh_abduction.theory import Speedups
 
 ROOT = Path(__file__).parent.parent
 ACES = Trace.load(ROOT / "examples" / "aces3-route.jsonl")
@@ -202,12 +187,12 @@ def test_the_version_is_that_of_the_package() -> None:
 def test_bad_input_is_a_value_error(bad: Callable[[], object]) -> None:
     with pytest.raises(ValueError, match="expected") as caught:
         bad()
-    assert isinstance(caught.value, SSHError)
+    assert isinstance(caught.value, AbductionError)
 
 
 def test_what_is_no_bad_input_is_no_value_error() -> None:
     assert not issubclass(InternalError, ValueError)
-    assert not issubclass(SSHError, ValueError)
+    assert not issubclass(AbductionError, ValueError)
     assert all(issubclass(error, ValueError) for error in (LearnerError, SimulatorError))
 
 

@@ -14,8 +14,10 @@ from pathlib import Path
 import pytest
 
 from simulator.motion import Pose, between
-from ssh_abduction import DState, SSHMap, Trace, TraceError, evaluate_visits
+from ssh_abduction import SSHMap, Trace
 from ssh_abduction.cli import main
+from ssh_abduction.data import DState, TraceError
+from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.evaluation.relations import Relation, Relations
 
 FREIBURG = Path(__file__).parent.parent.parent / "shared" / "data" / "logs"

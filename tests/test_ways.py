@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import traces
 
-from ssh_abduction import Search, Speedups, Status, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp.facts import most_paths
 from ssh_abduction.solver.asp.limits import LimitError, Watch
@@ -24,6 +25,7 @@ from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.frameless import FramelessEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
+from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.speedups import SPEEDUPS
 

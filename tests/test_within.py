@@ -14,11 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
 
-from ssh_abduction import Cost, SolverError, Status, Theory, Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.claims import false_claims
+from ssh_abduction.data import SolverError
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver import prefixes
+from ssh_abduction.solver import Cost, Status, prefixes
 from ssh_abduction.solver.search import Search
 from ssh_abduction.theory.rules import Rules
 

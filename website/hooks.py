@@ -28,11 +28,15 @@ THEMES: dict[str, tuple[str, ...]] = {
     "What an answer says": ("Solution", "Status", "Cost", "Bound", "Certificate", "Level", "Progress", "Backbone"),
     "Maps": ("SSHMap", "DState", "Path", "Pose", "Fit"),
     "Rival maps": ("compare", "Comparison", "difference", "Difference", "Listing", "view_page", "Page"),
-    "Why": ("rivals.explain.explain_pair", "rivals.explain.explain_trace", "explain.why_apart", "front.fault_front"),
+    "Why": ("explain.pairs.explain_pair", "explain.pairs.explain_trace", "explain.no_map.why_apart", "solver.front.fault_front"),
     "Is a map right?": ("evaluate", "Evaluation", "MapEvaluation", "evaluate_visits", "VisitsEvaluation", "ladder", "Rung"),
     "Using a map": ("route", "Route", "Move", "export_map", "Localiser", "Belief", "Chances"),
     "While the robot drives": ("OnlineMapper", "next_experiment", "Experiment", "Explorer", "Exploration"),
-    "From images to recognition": ("learner.BootstrapLearner", "perception.views.ViewClusterer", "perception.recognition.recogniser"),
+    "From images to recognition": (
+        "learning.learner.BootstrapLearner",
+        "perception.views.ViewClusterer",
+        "perception.recognition.recogniser",
+    ),
     "Simulated robots": (
         "simulator.tours.simulate",
         "simulator.world.World",
@@ -42,7 +46,7 @@ THEMES: dict[str, tuple[str, ...]] = {
         "simulator.plans.tour",
     ),
     "Errors": (
-        "SSHError",
+        "AbductionError",
         "TraceError",
         "TheoryError",
         "MapError",

@@ -45,7 +45,7 @@ from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.verbosity import add_verbosity, telling
 from ssh_abduction.data import program
-from ssh_abduction.data.errors import SSHError, named, printable
+from ssh_abduction.data.errors import AbductionError, named, printable
 
 EXIT_ERROR = 1
 MENDS = {
@@ -183,7 +183,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         sys.stdout.reconfigure(encoding="utf-8", errors="backslashreplace")  # what is left is half a character, which JSON writes so
     try:
         if sys.stdout is None:
-            raise SSHError("standard output: expected a place to print to, got a closed stream; open it, or send it to a file")
+            raise AbductionError("standard output: expected a place to print to, got a closed stream; open it, or send it to a file")
         with telling(options, for_programs), warnings.catch_warnings(record=True) as caught:
             try:
                 with Guard(lambda: None, lambda _: ("", program.interrupted_code()), None, None):
@@ -192,7 +192,7 @@ def _main(arguments: Sequence[str] | None) -> int:
                 for warning in caught:
                     print(f"ssh-abduction: warning: {printable(str(warning.message))}", file=sys.stderr)
         sys.stdout.flush()
-    except SSHError as error:
+    except AbductionError as error:
         print(f"ssh-abduction: {error}", file=sys.stderr)
         return EXIT_ERROR
     except BrokenPipeError:

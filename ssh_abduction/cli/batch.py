@@ -39,16 +39,12 @@ from ssh_abduction.cli.outcome import (
     warnings_of,
 )
 from ssh_abduction.cli.text import headline
-from ssh_abduction.data.errors import SolverError, SSHError, brief, named, printable
+from ssh_abduction.data.errors import AbductionError, SolverError, brief, named, printable
 from ssh_abduction.data.program import SIGNALLED, interrupted_code
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.solver.asp import workers
-from ssh_abduction.solver.asp.limits import POLL
-from ssh_abduction.solver.asp.limits import Stop as SearchStop
-from ssh_abduction.solver.result import Solution
-from ssh_abduction.solver.search import Search
-from ssh_abduction.solver.sharing import Backbone
+from ssh_abduction.solver import POLL, Backbone, Search, Solution, workers
+from ssh_abduction.solver import Stop as SearchStop
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
@@ -94,7 +90,7 @@ class Stop:
 
 def in_a_line(error: Exception) -> str:
     """What went wrong, in one line."""
-    return printable(" ".join((str(error) if isinstance(error, SSHError) else f"{type(error).__name__}: {error}").split()))
+    return printable(" ".join((str(error) if isinstance(error, AbductionError) else f"{type(error).__name__}: {error}").split()))
 
 
 class Asked(Protocol):
@@ -242,9 +238,11 @@ class Question:
 def run(options: argparse.Namespace) -> int:
     paths: list[str] = options.traces
     if "-" in paths:
-        raise SSHError("-: expected files where there are several traces, --jobs or --scheduler, got standard input; save it to a file")
+        raise AbductionError(
+            "-: expected files where there are several traces, --jobs or --scheduler, got standard input; save it to a file"
+        )
     if options.jobs == 0:
-        raise SSHError("--jobs: expected how many traces to solve at a time, or -1 for one a core, got 0; leave it out for 1")
+        raise AbductionError("--jobs: expected how many traces to solve at a time, or -1 for one a core, got 0; leave it out for 1")
     speedups = Speedups.without(options.without_speedups)
     if options.scheduler or options.jobs not in (None, 1):
         speedups = replace(speedups, threads=False)  # the processors have other traces to solve
@@ -322,20 +320,24 @@ def on_cluster(question: Asked, paths: Sequence[str], address: str, jobs: int | 
     try:
         from distributed import Client
     except ImportError:
-        raise SSHError("--scheduler: expected the package distributed, got none; pip install 'ssh-abduction[cluster]'") from None
+        raise AbductionError("--scheduler: expected the package distributed, got none; pip install 'ssh-abduction[cluster]'") from None
     if not re.search(r"^inproc:|:\d+$", address):
-        raise SSHError(f"--scheduler: expected an address with a port, such as tcp://host:8786, got {brief(address)}")
+        raise AbductionError(f"--scheduler: expected an address with a port, such as tcp://host:8786, got {brief(address)}")
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what goes wrong is in the answers
     warnings.filterwarnings("ignore", "Sending large graph")  # a long trace goes to one worker, once
     try:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except Exception as error:  # whatever else listens there may answer anything
-        raise SSHError(f"--scheduler: expected a Dask scheduler at {address}, got none ({error}); start one with: dask scheduler") from None
+        raise AbductionError(
+            f"--scheduler: expected a Dask scheduler at {address}, got none ({error}); start one with: dask scheduler"
+        ) from None
     with client:
         try:
             client.wait_for_workers(1, timeout=PATIENCE)
         except TimeoutError:
-            raise SSHError(f"--scheduler: expected a worker, got none in {PATIENCE} s; start one with: dask worker {address}") from None
+            raise AbductionError(
+                f"--scheduler: expected a worker, got none in {PATIENCE} s; start one with: dask worker {address}"
+            ) from None
         most = jobs if jobs is not None and jobs > 0 else max(1, 2 * sum(client.ncores().values()))
         absence = Absence(lambda: len(client.ncores()), question.limit, address)
         for answer in _answers(question, paths, partial(_on_workers, question, client, most, absence)):

@@ -15,10 +15,7 @@ from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import MapError, brief, is_finite, printable
 from ssh_abduction.data.maps import SSHMap, maps_of, read_json
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.ranking import Ranking
-from ssh_abduction.solver.result import Solution, summary_of
-from ssh_abduction.solver.sharing import Sharing
-from ssh_abduction.solver.steps.certificate import RESTS_ON
+from ssh_abduction.solver import RESTS_ON, Ranking, Sharing, Solution, summary_of
 from ssh_abduction.theory.theory import Theory
 
 EXIT_VIOLATED = 20

@@ -12,10 +12,10 @@ from pathlib import Path
 from ssh_abduction.cli.options import Verbs, add_output, check_picture, picture_file, seed, write
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.runner_up import SECONDS, runner_up, second_map, with_runner_up
-from ssh_abduction.solver.search import solve
+from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory
 
 
@@ -47,10 +47,10 @@ def run(options: argparse.Namespace) -> int:
     try:
         images = features.fit_transform(logged)
         clusterer = ViewClusterer(k=options.k, k_max=options.k_max, random_state=options.seed, by=options.by).fit(images)
-    except SSHError as error:
-        raise SSHError(f"{options.trace}: {error}") from None
+    except AbductionError as error:
+        raise AbductionError(f"{options.trace}: {error}") from None
     except ValueError as error:  # scikit-learn's own words for what cannot be clustered
-        raise SSHError(f"{options.trace}: images: {error}; log more images, or others") from None
+        raise AbductionError(f"{options.trace}: images: {error}; log more images, or others") from None
     truth = true_dstates(trace)
     uncertainty: dict[int, float] = {}
     if truth is not None:
@@ -85,7 +85,7 @@ def doubts(trace: Trace) -> list[str]:
     theory = Theory.topological() if all(action.kind for action in trace.actions) else Theory.causal()
     try:
         found = second_map(trace, solve(trace, theory, limit=SECONDS).maps, theory) if runner_up(trace) else None
-    except SSHError:  # the trace lacks what the theory needs: `solve` will say so
+    except AbductionError:  # the trace lacks what the theory needs: `solve` will say so
         return []
     return [found.sentence] if found else []
 

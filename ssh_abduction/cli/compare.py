@@ -14,7 +14,7 @@ from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import read_json
 
 if TYPE_CHECKING:
-    from ssh_abduction.rivals.compare import Comparison
+    from ssh_abduction.rivals.comparison import Comparison
 
 # Figures of a run that differ from one time to the next though nothing else does.
 UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
@@ -37,8 +37,8 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.rivals.compare import compare  # which loads numpy
-    from ssh_abduction.rivals.difference import difference
+    from ssh_abduction.rivals.comparison import compare  # which loads numpy
+    from ssh_abduction.rivals.differences import difference
     from ssh_abduction.rivals.listing import Listing
 
     maps, others = within(options.maps), within(options.other) if options.other is not None else None

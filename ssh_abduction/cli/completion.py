@@ -6,7 +6,7 @@ import argparse
 import re
 
 from ssh_abduction.cli.options import Verbs
-from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.errors import AbductionError
 
 SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")
 
@@ -26,9 +26,9 @@ def run(options: argparse.Namespace) -> int:
     try:
         import shtab
     except ImportError:
-        raise SSHError("completion: expected the package shtab, got none; pip install 'ssh-abduction[completion]'") from None
+        raise AbductionError("completion: expected the package shtab, got none; pip install 'ssh-abduction[completion]'") from None
     if options.shell not in shtab.SUPPORTED_SHELLS:
-        raise SSHError(f"completion: expected a shtab that knows {options.shell}, got {shtab.__version__}; pip install -U shtab")
+        raise AbductionError(f"completion: expected a shtab that knows {options.shell}, got {shtab.__version__}; pip install -U shtab")
     from ssh_abduction.cli import parser
 
     top = parser()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ssh_abduction.cli.options import Verbs, output
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.errors import SSHError, named
+from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import shipped, write_file
 
 
@@ -23,7 +23,7 @@ def run(options: argparse.Namespace) -> int:
     examples = {folder / path.name: path.read_bytes() for path in sorted(shipped("examples").iterdir()) if path.is_file()}
     changed = [path for path, data in examples.items() if path.exists() and not (path.is_file() and path.read_bytes() == data)]
     if changed:
-        raise SSHError(
+        raise AbductionError(
             f"{named(changed[0])}: expected no file, or the example of this name, got another one; nothing was copied: "
             "move it away, or take another folder (-o FOLDER)"
         )

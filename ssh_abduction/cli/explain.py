@@ -8,12 +8,11 @@ from typing import Any
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, read_maps, theory_of
 from ssh_abduction.cli.outcome import dump, on_ctrl_c
-from ssh_abduction.data.errors import MapError, SSHError, named
+from ssh_abduction.data.errors import AbductionError, MapError, named
 from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.pairs import PairExplanation, PairQuestion, TraceExplanation, TraceQuestion, Verdict
-from ssh_abduction.solver.asp.limits import Stop
-from ssh_abduction.solver.recorded import theory_in
+from ssh_abduction.solver import Stop, theory_in
 from ssh_abduction.theory.theory import Theory
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
@@ -41,7 +40,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     if len(options.steps) not in (0, 2):
-        raise SSHError(f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are to be explained")
+        raise AbductionError(f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are to be explained")
     trace = Trace.load(options.trace)
     theory = theory_of(options, _theory_in(options.theory_of) if options.theory_of else None)
     limits: dict[str, Any] = {"limit": options.time_limit, "memory": options.memory_limit}

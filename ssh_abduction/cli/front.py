@@ -8,16 +8,16 @@ from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.outcome import dump
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data import program
-from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.front import Front, fault_front
+from ssh_abduction.solver import Front, fault_front
 from ssh_abduction.theory.theory import Theory
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the front. Exit code 0 if all of it is proven, 20 if it is proven that there is no map, and else 10, as for solve."""
     if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
-        raise SSHError("--front: expected one trace, got several, or --jobs or --scheduler; ask for each trace by itself")
+        raise AbductionError("--front: expected one trace, got several, or --jobs or --scheduler; ask for each trace by itself")
     front = fault_front(Trace.load(options.traces[0]), theory_of(options, Theory.causal()), options.front, options.time_limit)
     print(dump(_as_data(front)) if options.json else _as_text(front, options.front))
     return 10 if front.stopped else 0 if front.points else 20

@@ -18,8 +18,7 @@ from types import TracebackType
 from typing import Any, NoReturn, Self
 
 from ssh_abduction.data import program
-from ssh_abduction.solver.asp.limits import POLL, Stop, resident_memory
-from ssh_abduction.solver.asp.process import end_all
+from ssh_abduction.solver import POLL, Stop, end_all, resident_memory
 
 LATE = 1.1, 0.8  # times the time limit, and seconds beyond that, after which a search is over, whatever it is at
 LARGE = 1.1, 100.0  # times the memory limit, and MiB beyond that

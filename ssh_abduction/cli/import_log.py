@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, add_output, write
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.errors import SSHError, named
+from ssh_abduction.data.errors import AbductionError, named
 
 if TYPE_CHECKING:
     from perception.readers.scans import RobotLog
@@ -99,7 +99,7 @@ def metres(text: str) -> float:
 
 
 def read(path: str, options: argparse.Namespace) -> RobotLog:
-    """A log, as the options say. Raises SSHError."""
+    """A log, as the options say. Raises AbductionError."""
     from perception.readers.logs import read_log
 
     return read_log(path, **reading_of(options))
@@ -122,7 +122,7 @@ def _told(field: str, text: str) -> Any:
     told: dict[str, Any] = {field: value}
     try:
         Told(**told)
-    except SSHError as error:
+    except AbductionError as error:
         raise argparse.ArgumentTypeError(str(error).partition(": ")[2]) from None
     return value
 
@@ -132,9 +132,9 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.cli.outcome import warn
 
     if options.log == "-":
-        raise SSHError("-: expected the file of a log, got standard input; save it to a file")
+        raise AbductionError("-: expected the file of a log, got standard input; save it to a file")
     if options.output != "-" and not Path(options.output).absolute().parent.is_dir():
-        raise SSHError(f"{named(options.output)}: cannot write the trace: its folder is not there; make it first")
+        raise AbductionError(f"{named(options.output)}: cannot write the trace: its folder is not there; make it first")
     doors = doors_of(options)
     log = read(options.log, options)
     warn(log.warnings)
@@ -148,13 +148,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 def doors_of(options: argparse.Namespace) -> bool | None:
-    """Whether doors are the places, as asked; None where the log is to tell. Raises SSHError for a scale of junctions where doors are asked for."""
+    """Whether doors are the places, as asked; None where the log is to tell. Raises AbductionError for a scale of junctions where doors are asked for."""
     if options.places is None:
         return None
     doors = bool(options.places == "doors")
     for name, given in (("--gateway", options.gateway), ("--radius", options.radius)):
         if doors and given is not None:
-            raise SSHError(
+            raise AbductionError(
                 f"{name}: expected none with --places doors, got {given:g}; it is about ways that part, so leave it out, or ask for junctions"
             )
     return doors

@@ -14,7 +14,7 @@ from ssh_abduction.cli.text import table
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.asp.limits import Stop
+from ssh_abduction.solver import Stop
 
 if TYPE_CHECKING:
     from ssh_abduction.evaluation.ladder import Rung

@@ -15,7 +15,7 @@ from ssh_abduction.data.errors import LocaliserError, MapError, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import maps_of
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.sharing import stretches
+from ssh_abduction.solver import stretches
 
 if TYPE_CHECKING:
     from ssh_abduction.online.localize import Localiser
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _localiser(options: argparse.Namespace) -> Localiser:
-    """The localiser that the options ask for. Raises SSHError that names the file that is wrong."""
+    """The localiser that the options ask for. Raises AbductionError that names the file that is wrong."""
     from ssh_abduction.online.localize import Chances, Localiser
 
     maps = maps_of(read_maps(options.maps), str(options.maps))

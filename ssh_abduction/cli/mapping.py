@@ -28,11 +28,10 @@ from ssh_abduction.cli.import_log import doors_of, named_after, reading_of
 from ssh_abduction.cli.options import choices_of, theory_of
 from ssh_abduction.cli.outcome import exit_code, on_ctrl_c, warn
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.errors import SolverError, SSHError, named
+from ssh_abduction.data.errors import AbductionError, SolverError, named
 from ssh_abduction.data.files import write_file
 from ssh_abduction.data.program import SIGNALLED, interrupted_code
-from ssh_abduction.solver.asp import workers
-from ssh_abduction.solver.asp.limits import Stop, check_limit
+from ssh_abduction.solver import Stop, check_limit, workers
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
@@ -221,11 +220,11 @@ class MapQuestion:
 
 def run(options: argparse.Namespace) -> int:
     if options.jobs == 0:
-        raise SSHError("--jobs: expected how many logs to map at a time, or -1 for one a core, got 0; leave it out for 1")
+        raise AbductionError("--jobs: expected how many logs to map at a time, or -1 for one a core, got 0; leave it out for 1")
     if "-" in options.logs:
-        raise SSHError("-: expected the files of logs, got standard input; save it to a file")
+        raise AbductionError("-: expected the files of logs, got standard input; save it to a file")
     if options.maps < 0:
-        raise SSHError(f"--maps: expected how many minimal maps to list, 0 for all, got {options.maps}")
+        raise AbductionError(f"--maps: expected how many minimal maps to list, 0 for all, got {options.maps}")
     check_limit("--time-limit", "seconds", options.time_limit)
     _check_folder(Path(options.output))
     question = MapQuestion(
@@ -252,7 +251,7 @@ def run(options: argparse.Namespace) -> int:
     for path in [*left]:
         try:
             _check_folder(folders[path])
-        except SSHError as error:
+        except AbductionError as error:
             print(f"{named(path)}: error: {error}", flush=True)
             left.remove(path)
             codes.append(EXIT_ERROR)
@@ -272,15 +271,15 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _alone(question: MapQuestion, left: list[str], folders: dict[str, Path]) -> int:
-    """Map the only log in this process, if it is not done already. Returns the exit code. Raises SSHError."""
+    """Map the only log in this process, if it is not done already. Returns the exit code. Raises AbductionError."""
 
     def keep(answer: MapAnswer) -> None:
         if answer.code == EXIT_ERROR:
-            raise SSHError(answer.line)
+            raise AbductionError(answer.line)
         try:
             write_run(folders[left[0]], answer.files)
         except OSError as error:
-            raise SSHError(unwritten(error, folders[left[0]])) from None
+            raise AbductionError(unwritten(error, folders[left[0]])) from None
         _say(answer, folders[left[0]])
         warn(answer.warnings)
 
@@ -334,12 +333,12 @@ def write_run(folder: Path, files: Sequence[tuple[str, bytes]]) -> None:
 
 
 def _check_folder(folder: Path) -> None:
-    """Whether a folder can be made and written, before hours of work. Raises SSHError."""
+    """Whether a folder can be made and written, before hours of work. Raises AbductionError."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not there.is_dir():
-        raise SSHError(f"{named(str(folder))}: expected a folder to write, got a file: {named(str(there))}; name another one")
+        raise AbductionError(f"{named(str(folder))}: expected a folder to write, got a file: {named(str(there))}; name another one")
     if not os.access(there, os.W_OK):
-        raise SSHError(
+        raise AbductionError(
             f"{named(str(folder))}: expected a folder that can be written, got no permission in {named(str(there))}; name another one"
         )
 
@@ -401,7 +400,7 @@ def _run_in(folder: Path) -> dict[str, Any]:
 
 def _content(path: str) -> str | None:
     """The digest of a log; None where it cannot be read, or only once."""
-    with suppress(OSError, SSHError):
+    with suppress(OSError, AbductionError):
         return digest(path)
     return None
 

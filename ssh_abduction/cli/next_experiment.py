@@ -15,7 +15,7 @@ from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import maps_of, read_json
 from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.asp.limits import Watch, check_limit
+from ssh_abduction.solver import Watch, check_limit
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.data.errors import MapError, SSHError, named
+from ssh_abduction.data.errors import AbductionError, MapError, named
 from ssh_abduction.data.maps import read_json
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.theory import ASSERTIONS, CHOICES, COUNTS, EXCUSED, PRESETS, SETTLED, Theory
@@ -79,7 +79,7 @@ def picture_file(text: str) -> str:
 
 
 def check_picture(file: str | None) -> None:
-    """Whether a picture that is asked for could be drawn, before hours of work. Raises SSHError."""
+    """Whether a picture that is asked for could be drawn, before hours of work. Raises AbductionError."""
     if file is None:
         return
     from ssh_abduction.evaluation.paper.figures import require_matplotlib
@@ -109,7 +109,7 @@ def read_maps(file: str, mend: str = "name the maps first, and then the trace") 
 def _is_trace(file: str) -> bool:
     try:
         return bool(Trace.load(file))
-    except SSHError:
+    except AbductionError:
         return False
 
 
@@ -138,7 +138,7 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
     default = Theory.causal() if theory.level == "causal" else Theory.topological()
     flags = ["--theory", "causal"] if theory.level == "causal" else []
     if trace is not None:
-        with suppress(SSHError):  # the theory was made for a trace that has what the default asks for; this one may be another
+        with suppress(AbductionError):  # the theory was made for a trace that has what the default asks for; this one may be another
             default = default.resolve(trace)
     for field in fields(Theory):
         value, flag = getattr(theory, field.name), f"--{field.name.replace('_', '-')}"

@@ -16,9 +16,7 @@ from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.no_map import Explanation, Interrupted, explain
 from ssh_abduction.learning.runner_up import second_map
-from ssh_abduction.solver import Search, Solution, Status, result
-from ssh_abduction.solver.engines.base import Cost
-from ssh_abduction.solver.sharing import Backbone
+from ssh_abduction.solver import Backbone, Cost, Search, Solution, Status, result
 
 SOON = 10_000  # steps of a trace in which noise is sought after Ctrl-C, at most: in 40,000 that takes two seconds
 

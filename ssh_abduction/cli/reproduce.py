@@ -10,7 +10,7 @@ from typing import Any
 
 from ssh_abduction.cli.options import Verbs, output
 from ssh_abduction.cli.text import table
-from ssh_abduction.data.errors import SSHError, brief, named
+from ssh_abduction.data.errors import AbductionError, brief, named
 
 MOST_SEEDS = 10_000  # a seed takes seconds: more are surely a slip of the hand, and would fill the memory before the first is run
 
@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
 
     seeds = _seeds(options.seeds)
     if options.jobs == 0:
-        raise SSHError("--jobs: expected how many processes, or -1 for one a core, got 0; leave it out for 2")
+        raise AbductionError("--jobs: expected how many processes, or -1 for one a core, got 0; leave it out for 2")
     folder = Path(options.output or f"out/{options.experiment}")
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as progress:
@@ -71,7 +71,7 @@ def _print(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
 
 
 def _seeds(text: str) -> list[int]:
-    """0-19 or 1,5,7. Raises SSHError."""
+    """0-19 or 1,5,7. Raises AbductionError."""
     try:
         found: list[int] = []
         for part in text.split(","):
@@ -81,7 +81,7 @@ def _seeds(text: str) -> list[int]:
                 raise ValueError
             found += numbers
     except (ValueError, OverflowError):
-        raise SSHError(
+        raise AbductionError(
             f"--seeds: expected numbers as 0-19 or 1,5,7, at most {MOST_SEEDS:,} and below {2**32:,}, got {brief(text)}"
         ) from None
     return found

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.options import Verbs, add_output, seed, write
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.errors import SSHError, named, printable
+from ssh_abduction.data.errors import AbductionError, named, printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     if options.log:
         return _write_log(options, _drive(options))
     if options.world.endswith(".xml"):
-        raise SSHError(
+        raise AbductionError(
             f"{named(options.world)}: expected --as carmen or --as bag beside a floor plan, as it has no route of actions; add that"
         )
     noise = Body.odometry if options.odometry_noise is None else options.odometry_noise
@@ -97,7 +97,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _drive(options: argparse.Namespace) -> Drive:
-    """The drive that is to be logged as robots do. Raises SSHError."""
+    """The drive that is to be logged as robots do. Raises AbductionError."""
     import math
 
     from simulator.drive import EVERY
@@ -116,7 +116,7 @@ def _drive(options: argparse.Namespace) -> Drive:
         ("-o -", options.output == "-"),
     ):
         if given:
-            raise SSHError(f"{name}: expected none beside --as, as a robot's log is a file of scans; leave it out")
+            raise AbductionError(f"{name}: expected none beside --as, as a robot's log is a file of scans; leave it out")
     odometer = Odometer(scale=options.scale_error, bend=math.radians(options.bend_error))
     if options.odometry_noise is not None:
         odometer = odometer.as_noisy_as(options.odometry_noise)
@@ -126,7 +126,7 @@ def _drive(options: argparse.Namespace) -> Drive:
         return record(world, options.tours, options.seed, odometer=odometer, every=every)
     for name in ("start", "route", "reach"):
         if getattr(options, name) is not None:
-            raise SSHError(f"--{name}: expected none beside a floor plan, whose rounds are drawn by --seed; leave it out")
+            raise AbductionError(f"--{name}: expected none beside a floor plan, whose rounds are drawn by --seed; leave it out")
     return record_plan(Plan.load(options.world), options.tours, options.seed, odometer=odometer, every=every)
 
 
@@ -149,7 +149,7 @@ def _write_log(options: argparse.Namespace, drive: Drive) -> int:
     try:
         write_file(truth, json.dumps(drive.truth).encode() + b"\n")
     except OSError as error:
-        raise SSHError(f"{named(truth)}: cannot write the truth: {error.strerror or error}; check the folder") from None
+        raise AbductionError(f"{named(truth)}: cannot write the truth: {error.strerror or error}; check the folder") from None
     print(
         f"{counted(len(drive), 'scans')} along {drive.metres:.0f} m of {printable(drive.name)} in {named(target)}, and the truth in {named(truth)}"
     )
@@ -168,13 +168,15 @@ def scans_of(drive: Drive) -> Iterator[Scan]:
 
 
 def _camera(options: argparse.Namespace) -> Camera | None:
-    """The camera that was asked for. Raises SSHError."""
+    """The camera that was asked for. Raises AbductionError."""
     from simulator.panorama import Camera, Paint
 
     if options.images == "ranges":
         for name in ("textures", "paint_seed", "hours"):
             if getattr(options, name) is not None:
-                raise SSHError(f"--{name.replace('_', '-')}: expected --images panoramas beside it, as ranges show no light; add that")
+                raise AbductionError(
+                    f"--{name.replace('_', '-')}: expected --images panoramas beside it, as ranges show no light; add that"
+                )
         return None
     paint = Paint(options.paint_seed or 0, repeated=options.textures == "repeated")
     if options.hours is None:
@@ -182,7 +184,7 @@ def _camera(options: argparse.Namespace) -> Camera | None:
     try:
         begin, end = (float(hour) for hour in options.hours.split(","))
     except ValueError:
-        raise SSHError(f"--hours: expected two hours with a comma between them, as 7,19, got {options.hours!r}; write two") from None
+        raise AbductionError(f"--hours: expected two hours with a comma between them, as 7,19, got {options.hours!r}; write two") from None
     return Camera(paint=paint, hours=(begin, end))
 
 
@@ -202,6 +204,6 @@ def _with_table(trace: Trace, target: str) -> Trace:
     try:
         write_file(path, packed.getvalue())
     except (OSError, ValueError) as error:
-        raise SSHError(f"{named(path)}: cannot write the images: {error}; check the folder") from None
+        raise AbductionError(f"{named(path)}: cannot write the images: {error}; check the folder") from None
     steps = tuple(replace(step, image=i) for i, step in enumerate(trace.steps))
     return replace(trace, steps=steps, images=path.name)

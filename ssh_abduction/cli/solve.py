@@ -32,10 +32,7 @@ from ssh_abduction.data.logs import PROGRESS
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.solver.asp.limits import Stop
-from ssh_abduction.solver.result import Progress, Solution, Status, summary_of
-from ssh_abduction.solver.search import Search
-from ssh_abduction.solver.sharing import Backbone
+from ssh_abduction.solver import Backbone, Progress, Search, Solution, Status, Stop, summary_of
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
 # So many maps are compared on the terminal, at most, and so many are put in order in JSON: of more the first ones found are compared, and all are printed as found.
@@ -225,7 +222,7 @@ def _lines(search: Search, solution: Solution, explanation: Explanation | None, 
     if backbone and not solution.minimal_listed:
         yield describe_backbone(backbone, search.trace)
     if len(solution.maps) > 1:
-        from ssh_abduction.rivals.compare import compare
+        from ssh_abduction.rivals.comparison import compare
         from ssh_abduction.rivals.listing import Listing
 
         some = "" if search.count == len(solution.maps) else f" (of the first {len(solution.maps)} found)"

@@ -11,12 +11,11 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted as counted  # noqa: PLC0414 - the verbs have it from here
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.solver.result import Solution, Status
-from ssh_abduction.solver.sharing import Backbone, stretches
+from ssh_abduction.solver import Backbone, Solution, Status, stretches
 from ssh_abduction.theory.evidence import evidence_of
 
 if TYPE_CHECKING:
-    from ssh_abduction.rivals.compare import Comparison, Matter
+    from ssh_abduction.rivals.comparison import Comparison, Matter
 
 # So many pairs of steps are told of, at most, as more cannot be taken in on a terminal.
 SHOWN_PAIRS = 12

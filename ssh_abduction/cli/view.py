@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, flags_of
-from ssh_abduction.data.errors import MapError, SSHError, brief, is_whole, named
+from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole, named
 
 if TYPE_CHECKING:
     from ssh_abduction.data.trace import Trace
@@ -52,11 +52,11 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.theory.theory import Theory
 
     if options.serve and options.trace is None:
-        raise SSHError("--serve: expected the trace that was mapped, got none; give it after the maps")
+        raise AbductionError("--serve: expected the trace that was mapped, got none; give it after the maps")
     if options.serve and options.output:
-        raise SSHError("--output: expected none with --serve, which writes no file; leave out one of the two")
+        raise AbductionError("--output: expected none with --serve, which writes no file; leave out one of the two")
     if not 0 <= options.port <= 65535:
-        raise SSHError(f"--port: expected 0 to 65535, got {options.port}; name a free port")
+        raise AbductionError(f"--port: expected 0 to 65535, got {options.port}; name a free port")
     data = read_json(options.maps)
     source = "standard input" if options.maps == "-" else options.maps
     listing = Listing.from_dict(data, source)
@@ -88,7 +88,7 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
 
     try:
         known = assumptions(listing, trace, theory, ASSUMING)
-    except SSHError:  # the file was made with a theory that does not suit this trace: then nobody can say
+    except AbductionError:  # the file was made with a theory that does not suit this trace: then nobody can say
         known = {}
     texts = list(dict.fromkeys(text for told in known.values() for text in (told["same"], told["different"])))
     number = {text: k for k, text in enumerate(texts)}
@@ -97,7 +97,7 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
 
 
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
-    """The run that is localised, if one was asked for. Raises SSHError."""
+    """The run that is localised, if one was asked for. Raises AbductionError."""
     from ssh_abduction.data.trace import Trace
     from ssh_abduction.page.content import Run
 
@@ -105,7 +105,9 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
         return None
     followed = Trace.load(options.localize) if options.localize is not None else trace
     if followed is None:
-        raise SSHError("--belief: expected the run that it is of, got none; name it with --localize, or give the trace that was mapped")
+        raise AbductionError(
+            "--belief: expected the run that it is of, got none; name it with --localize, or give the trace that was mapped"
+        )
     if options.belief is None:
         from ssh_abduction.online.localize import Localiser
 
@@ -150,12 +152,12 @@ def _serve(
 
     from ssh_abduction.data import program
     from ssh_abduction.page.server import PageServer
-    from ssh_abduction.solver.asp.process import end_all
+    from ssh_abduction.solver import end_all
 
     try:
         server = PageServer(listing, trace, theory, run=localised, called=called, port=options.port, limit=options.time_limit)
     except OSError as error:
-        raise SSHError(f"--port: expected a free port, got {options.port}: {error.strerror}; name another one") from None
+        raise AbductionError(f"--port: expected a free port, got {options.port}: {error.strerror}; name another one") from None
     with server:
         print(server.url, flush=True)
         if not options.no_open:

@@ -1,0 +1,64 @@
+"""The values that all other packages share: traces, maps, stars, odometry, files and errors.
+
+Each name is loaded when it is first used: `program` must be importable before any other module is.
+"""
+
+from ssh_abduction import lazy_names
+
+TYPE_CHECKING = False
+
+if TYPE_CHECKING:
+    from ssh_abduction.data.errors import AbductionError, LocaliserError, MapError, RangeError, SolverError, TheoryError, TraceError
+    from ssh_abduction.data.maps import DState, Fault, Fit, MapPath, Pose, SSHMap
+    from ssh_abduction.data.odometry import Odometry
+    from ssh_abduction.data.star import Star
+    from ssh_abduction.data.trace import Action, Step, Trace
+
+_HOMES = {  # module: the names that this package exports from it
+    "errors": (
+        "AbductionError",
+        "LocaliserError",
+        "MapError",
+        "RangeError",
+        "SolverError",
+        "TheoryError",
+        "TraceError",
+    ),
+    "maps": (
+        "DState",
+        "Fault",
+        "Fit",
+        "MapPath",
+        "Pose",
+        "SSHMap",
+    ),
+    "odometry": ("Odometry",),
+    "star": ("Star",),
+    "trace": (
+        "Action",
+        "Step",
+        "Trace",
+    ),
+}
+__all__ = [
+    "AbductionError",
+    "Action",
+    "DState",
+    "Fault",
+    "Fit",
+    "LocaliserError",
+    "MapError",
+    "MapPath",
+    "Odometry",
+    "Pose",
+    "RangeError",
+    "SSHMap",
+    "SolverError",
+    "Star",
+    "Step",
+    "TheoryError",
+    "Trace",
+    "TraceError",
+]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -22,10 +22,10 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias, TypeVar
 
-from ssh_abduction.data.errors import SSHError, brief, is_finite, is_whole
+from ssh_abduction.data.errors import AbductionError, brief, is_finite, is_whole
 
 T = TypeVar("T")
-Kind: TypeAlias = type[SSHError]
+Kind: TypeAlias = type[AbductionError]
 
 
 def a_number(

@@ -1,7 +1,7 @@
 """Every error that a user can cause or mend: one root, one subclass a layer.
 
 What bad input causes is a ValueError, too, so that programs which know nothing of this package catch it. What bad input does not cause is none: a defect of
-this program (`InternalError` of `solver/judging.py`), and what is missing on a machine, which is an SSHError alone. Limits that are over are no errors: `Solution.stopped` says so.
+this program (`InternalError` of `solver/judging.py`), and what is missing on a machine, which is an AbductionError alone. Limits that are over are no errors: `Solution.stopped` says so.
 """
 
 from __future__ import annotations
@@ -12,34 +12,34 @@ import re
 from typing import TypeGuard
 
 
-class SSHError(Exception):
+class AbductionError(Exception):
     """Root of the package's errors. Its text is one line: what was expected, what came, how to mend it."""
 
     def __str__(self) -> str:
         return printable(super().__str__())  # names of files and views may hold anything
 
 
-class TraceError(SSHError, ValueError):
+class TraceError(AbductionError, ValueError):
     """A trace, or a file of one, is malformed."""
 
 
-class TheoryError(SSHError, ValueError):
+class TheoryError(AbductionError, ValueError):
     """The choices of a theory contradict each other, or the trace lacks what they need."""
 
 
-class MapError(SSHError, ValueError):
+class MapError(AbductionError, ValueError):
     """A map, or a file of maps, is malformed."""
 
 
-class LocaliserError(SSHError, ValueError):
+class LocaliserError(AbductionError, ValueError):
     """What a localiser is made of, or is asked, does not fit."""
 
 
-class SolverError(SSHError, ValueError):
+class SolverError(AbductionError, ValueError):
     """The solver cannot do what was asked."""
 
 
-class RangeError(SSHError, ValueError, IndexError):
+class RangeError(AbductionError, ValueError, IndexError):
     """A step or a map that there is not. The text names the range."""
 
 

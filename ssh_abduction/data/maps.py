@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ssh_abduction.data import cards
@@ -103,7 +103,7 @@ class Fit:
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class MapPath:
     """A path: its places in the order in which direction +1 meets them. With path_order=partial this is one of the orders that the map allows."""
 
     id: int
@@ -158,7 +158,7 @@ class SSHMap:
     dstates: tuple[DState, ...]
     links: tuple[tuple[int, str, int], ...]
     places: tuple[int, ...] = ()
-    paths: tuple[Path, ...] = field(default=(), compare=False)
+    paths: tuple[MapPath, ...] = field(default=(), compare=False)
     excused: tuple[tuple[int, int], ...] = field(default=(), compare=False)
     fit: Fit | None = field(default=None, compare=False)
     faults: tuple[Fault, ...] = ()
@@ -233,7 +233,7 @@ class SSHMap:
             links=tuple(sorted({(number[s], action, number[x]) for s, action, x in self.links})),
             places=tuple(sorted(place.values())),
             paths=tuple(
-                Path(path[p.id], tuple(place[q] for q in (p.order if faced.get(p.id, 1) != -1 else p.order[::-1])))
+                MapPath(path[p.id], tuple(place[q] for q in (p.order if faced.get(p.id, 1) != -1 else p.order[::-1])))
                 for p in sorted(self.paths, key=lambda p: path[p.id])
             ),
             excused=tuple((path.get(h, h), path.get(g, g)) for h, g in self.excused),
@@ -534,7 +534,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def _read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
-    with FilePath(path).open("rb") as file:
+    with Path(path).open("rb") as file:
         return file.read(most + 1)
 
 
@@ -635,12 +635,12 @@ class FieldReader:
             heading,
         )
 
-    def path(self, value: Any, name: str) -> Path:
+    def path(self, value: Any, name: str) -> MapPath:
         record = self.mapping(value, name)
         order = tuple(self.integer(p, f"{name}.order[{i}]") for i, p in enumerate(self.list(record, "order")))
         if len(set(order)) < len(order):
             raise self.wrong(f"{name}.order", "each place once", list(order))
-        return Path(self.integer(record.get("id"), f"{name}.id"), order)
+        return MapPath(self.integer(record.get("id"), f"{name}.id"), order)
 
     def link(self, value: Any, ids: set[int], name: str) -> tuple[int, str, int]:
         good = isinstance(value, list) and len(value) == 3 and type(value[0]) is type(value[2]) is int and isinstance(value[1], str)

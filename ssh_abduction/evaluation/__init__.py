@@ -1,4 +1,4 @@
-"""How right maps are. Nothing that infers maps may import this folder: it knows the truth, and infers nothing."""
+"""Compare maps with the truth, rung by rung of evidence, and repeat the paper's experiments."""
 
 from ssh_abduction.evaluation.names import Evaluation, MapEvaluation, evaluate, tells_names
 from ssh_abduction.evaluation.relations import Relation, Relations

@@ -20,9 +20,7 @@ from ssh_abduction.data.checks import a_flag, a_whole_number, an_instance
 from ssh_abduction.data.errors import MapError, SolverError, TheoryError
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.evaluation import Evaluation, evaluate, tells_names
-from ssh_abduction.solver.asp.limits import check_limit
-from ssh_abduction.solver.result import Solution
-from ssh_abduction.solver.search import Search
+from ssh_abduction.solver import Search, Solution, check_limit
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 

@@ -1,7 +1,8 @@
 """How right maps are, where the truth is no name but a pose: are the visits that a map has at one place truly at one place?
 
 >>> from dataclasses import replace
->>> from ssh_abduction import Theory, Trace, evaluate_visits, solve
+>>> from ssh_abduction import Theory, Trace, solve
+>>> from ssh_abduction.evaluation import evaluate_visits
 >>> seen = Trace.from_steps("abab", [{"name": "go", "kind": "travel"}] * 3)
 >>> poses = [0, 0, 0], [9, 0, 0], [0.5, 0, 0], [0, 9, 0]
 >>> trace = replace(seen, steps=tuple(replace(step, truth={"pose": pose}) for step, pose in zip(seen.steps, poses)))

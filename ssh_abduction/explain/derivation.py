@@ -25,7 +25,7 @@ from ssh_abduction.checker.checker import Violation, check, unchecked
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Assumption, Axioms, Clash, Piece, why_apart
-from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver import facts
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.theory import EXCUSED
 

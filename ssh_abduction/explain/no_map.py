@@ -19,8 +19,7 @@ import clingo
 from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace, checked_trace
-from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.asp.rules import check_rules
+from ssh_abduction.solver import check_rules, facts
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Displacement, Equality, Planar, evidence_of
 from ssh_abduction.theory.theory import ASSERTIONS, Theory, checked_theory

@@ -20,16 +20,11 @@ from enum import Enum
 from typing import Any
 
 from ssh_abduction.data.checks import a_whole_number
-from ssh_abduction.data.errors import SolverError, SSHError, TraceError, brief, is_whole
+from ssh_abduction.data.errors import AbductionError, SolverError, TraceError, brief, is_whole
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View, checked_trace
 from ssh_abduction.explain.derivation import Derivation, derive
 from ssh_abduction.explain.no_map import Axioms, Explanation, Interrupted, Piece, explain
-from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.asp.limits import LimitError, Stop, Watch, check_limit
-from ssh_abduction.solver.asp.rules import check_rules
-from ssh_abduction.solver.engines.base import Cost
-from ssh_abduction.solver.result import Progress, Status
-from ssh_abduction.solver.search import Search
+from ssh_abduction.solver import Cost, LimitError, Progress, Search, Status, Stop, Watch, check_limit, check_rules, facts
 from ssh_abduction.theory.theory import ASSERTIONS, Theory, checked_theory
 
 SMALL = 14  # Pieces of up to so many steps are asked before the whole trace: that takes less than a second.
@@ -621,7 +616,7 @@ class TraceQuestion(_Question):
         """Whether the changed trace still has what the theory reads."""
         try:
             theory.resolve(trace)
-        except SSHError:
+        except AbductionError:
             return False
         return True
 

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from perception.confidence import NOISE
 from perception.recognition import recogniser
-from ssh_abduction.data.errors import SSHError, brief, is_whole
+from ssh_abduction.data.errors import AbductionError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.traces import Traces
-from ssh_abduction.solver.result import Solution, Status
+from ssh_abduction.solver import Solution, Status
 
 
-class LearnerError(SSHError, ValueError):
+class LearnerError(AbductionError, ValueError):
     """The loop cannot be closed: there is no map, or the maps agree on no label."""
 
 

@@ -24,7 +24,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.labels import AmbiguousMapWarning, LearnerError, labels_of, labels_of_all, labels_on, map_of
 from ssh_abduction.learning.runner_up import RunnerUpWarning, warn_of_second_map
 from ssh_abduction.learning.traces import Traces
-from ssh_abduction.solver.search import solve
+from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 __all__ = ["AmbiguousMapWarning", "BootstrapLearner", "LearnerError", "RunnerUpWarning", "labels_of"]

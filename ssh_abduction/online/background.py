@@ -14,11 +14,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.online.beside import Beside
-from ssh_abduction.solver.asp.control import has_processors
-from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.asp.process import in_process
-from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.engines.framed import FramedEngine
+from ssh_abduction.solver import FramedEngine, Task, Watch, has_processors, in_process
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 

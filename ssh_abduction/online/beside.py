@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Generic, TypeVar
 
-from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver import LimitError, Watch
 
 Result = TypeVar("Result")
 

@@ -39,9 +39,7 @@ from ssh_abduction.online.mapper import OnlineMapper
 from ssh_abduction.rivals.explore import Experiment, next_experiment
 from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.rivals.tour import next_tour
-from ssh_abduction.solver.asp.limits import check_limit
-from ssh_abduction.solver.result import Solution, Status
-from ssh_abduction.solver.search import solve
+from ssh_abduction.solver import Solution, Status, check_limit, solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # Where nothing is left to do, but the map is not proven minimal, so many times the limit of a step are spent on it.
@@ -121,7 +119,8 @@ class Explorer:
 
     Raises TraceError where the robot's looks do not fit the theory, TheoryError for a theory with faults.
 
-    >>> from ssh_abduction import Explorer, Step, Theory
+    >>> from ssh_abduction import Explorer, Theory
+    >>> from ssh_abduction.data import Step
     >>> class Ring:
     ...     at = 0
     ...     def look(self):

@@ -63,13 +63,8 @@ from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace, View
-from ssh_abduction.solver.asp.limits import check_limit
-from ssh_abduction.solver.engines.base import AT_ONCE, Cost
-from ssh_abduction.solver.guesses.tree import Sketch
-from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.result import Seconds, Solution, Status
+from ssh_abduction.solver import AT_ONCE, Cost, Judging, Outcome, Seconds, Sketch, Solution, Status, check_limit, observation
 from ssh_abduction.solver.search import ALL, Search
-from ssh_abduction.solver.steps.log import Outcome, observation
 from ssh_abduction.theory.evidence import NO_PAIRS, Pairs, evidence_of, pairs_of, said_by
 from ssh_abduction.theory.evidence.displacement import count_returns
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row

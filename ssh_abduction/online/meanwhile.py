@@ -8,11 +8,7 @@ from functools import partial
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.beside import Beside
-from ssh_abduction.solver.asp.control import has_processors
-from ssh_abduction.solver.asp.limits import Stop, Watch
-from ssh_abduction.solver.asp.process import in_process
-from ssh_abduction.solver.result import Bound, Status
-from ssh_abduction.solver.search import solve
+from ssh_abduction.solver import Bound, Status, Stop, Watch, has_processors, in_process, solve
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 

@@ -37,10 +37,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.localize import Belief, Chances, Localiser
 from ssh_abduction.online.meanwhile import Meanwhile, Solved, solved
 from ssh_abduction.online.rivals import Rival, Scale
-from ssh_abduction.solver.engines.base import cost_as_counted
-from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.result import Bound, Seconds, Solution, Status
-from ssh_abduction.solver.steps.log import observation
+from ssh_abduction.solver import Bound, Judging, Seconds, Solution, Status, cost_as_counted, observation
 from ssh_abduction.theory.evidence import evidence_of, pairs_of
 from ssh_abduction.theory.speedups import Speedups, row
 from ssh_abduction.theory.theory import Theory

@@ -24,8 +24,7 @@ from dataclasses import dataclass, replace
 
 from ssh_abduction.data.maps import DState, Fault, SSHMap
 from ssh_abduction.data.trace import Step, Trace
-from ssh_abduction.solver.engines.base import Cost
-from ssh_abduction.solver.steps.log import observation
+from ssh_abduction.solver import Cost, observation
 from ssh_abduction.theory.theory import Theory
 
 Seen = tuple[object, object]  # as `observation` returns it: the view, and the star where the theory uses stars

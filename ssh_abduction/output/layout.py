@@ -28,7 +28,7 @@ from ssh_abduction.data.errors import MapError, brief, is_finite
 from ssh_abduction.data.trace import Trace
 
 if TYPE_CHECKING:
-    from ssh_abduction.data.maps import DState, Path, Pose, SSHMap
+    from ssh_abduction.data.maps import DState, MapPath, Pose, SSHMap
 
 Point: TypeAlias = tuple[float, float]
 Turns: TypeAlias = Mapping[str, "str | float"]
@@ -123,7 +123,7 @@ def degrees_of(turns: Trace | Turns | None) -> dict[str, tuple[float, float]]:
     return degrees
 
 
-def travelled(ssh_map: SSHMap, path: Path) -> list[tuple[int, int]]:
+def travelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
     """The pairs of places on a path between which the robot travelled, the lower number first."""
     ends = [(ssh_map.dstates[s], ssh_map.dstates[x]) for s, _, x in ssh_map.links]
     pairs = {(a.place, b.place) for a, b in ends if a.path == b.path == path.id}

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.pairs import PairExplanation, explain_pair
-from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.result import Solution
-from ssh_abduction.solver.search import solve
+from ssh_abduction.solver import Solution, Watch, solve
 from ssh_abduction.theory.theory import Theory
 
 

@@ -16,10 +16,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Axioms, Interrupted, Piece
 from ssh_abduction.explain.pairs import SMALL, UNCUT, PairExplanation, Side, Verdict
 from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.engines.base import Cost
-from ssh_abduction.solver.result import Status
-from ssh_abduction.solver.search import solve
+from ssh_abduction.solver import Cost, Status, facts, solve
 from ssh_abduction.theory.theory import Theory
 
 Pair = tuple[int, int]

@@ -21,7 +21,7 @@ from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.output.layout import Layout, layout
 from ssh_abduction.output.metric_picture import axes
 from ssh_abduction.page.images import drawn_images
-from ssh_abduction.rivals.compare import compare
+from ssh_abduction.rivals.comparison import compare
 from ssh_abduction.rivals.listing import Listing, Maps
 
 Steps: TypeAlias = tuple[int, ...]

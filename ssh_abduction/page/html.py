@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 from ssh_abduction.data.checks import a_function
@@ -19,7 +19,7 @@ from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.page.content import Run, content_of
 from ssh_abduction.rivals.listing import Maps
 
-HERE = FilePath(__file__).parent
+HERE = Path(__file__).parent
 ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 
 

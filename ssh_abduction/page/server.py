@@ -22,14 +22,13 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from ssh_abduction.data.errors import MapError, SSHError, brief, is_whole
+from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.page import answers
 from ssh_abduction.page.content import Called, Run, content_of
 from ssh_abduction.page.html import html_of
 from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.asp.process import in_process
+from ssh_abduction.solver import LimitError, Watch, in_process
 from ssh_abduction.theory.theory import Theory
 
 LARGEST = 100_000  # bytes of a question
@@ -85,7 +84,7 @@ class PageServer(ThreadingHTTPServer):
         return self._page
 
     def answer(self, question: str, data: Mapping[str, Any], watch: Watch) -> dict[str, Any]:
-        """The answer to a question of the page. Raises SSHError, and LimitError when the watch says so."""
+        """The answer to a question of the page. Raises AbductionError, and LimitError when the watch says so."""
         if question not in ("explain", "solve"):
             raise MapError(f"expected explain or solve, got {brief(question)}")
         theory = self._assuming(data)
@@ -164,7 +163,7 @@ class _Handler(BaseHTTPRequestHandler):
                 told = self.server.answer(asked, data, watch)
         except LimitError as error:
             told = {"error": f"none was found in time ({error.reason}); --time-limit gives it more"}
-        except (SSHError, ValueError, RecursionError) as error:
+        except (AbductionError, ValueError, RecursionError) as error:
             told = {"error": str(error)}
         if not watch.interrupted:
             self._send(HTTPStatus.OK, json.dumps(told).encode(), "application/json")

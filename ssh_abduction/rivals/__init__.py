@@ -1,1 +1,8 @@
-"""What users do with the maps that rival each other: compare them, explain them, tell them apart."""
+"""Compare the minimal maps of a trace, and find the next experiment that tells them apart."""
+
+from ssh_abduction.rivals.comparison import Comparison, compare
+from ssh_abduction.rivals.differences import Difference, difference
+from ssh_abduction.rivals.explore import Experiment, next_experiment
+from ssh_abduction.rivals.listing import Listing
+
+__all__ = ["Comparison", "Difference", "Experiment", "Listing", "compare", "difference", "next_experiment"]

@@ -45,9 +45,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Trace, checked_trace
 from ssh_abduction.rivals.consequences import Consequence, Consequences, is_possible
 from ssh_abduction.rivals.machines import UNKNOWN, Machine, Row, Seen, Sights, Table, Walk, links_of, machine_of, with_ends
-from ssh_abduction.solver.asp.limits import LimitError, Stop, Watch, check_limit
-from ssh_abduction.solver.result import Solution
-from ssh_abduction.solver.sharing import stretches
+from ssh_abduction.solver import LimitError, Solution, Stop, Watch, check_limit, stretches
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # What a robot can do where it sees this.

@@ -20,9 +20,7 @@ from ssh_abduction.data.checks import a_flag, a_text, an_instance
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.maps import ID_LENGTH, SSHMap, maps_of, read_json
 from ssh_abduction.data.trace import View
-from ssh_abduction.solver.recorded import theory_in
-from ssh_abduction.solver.result import Solution, Status
-from ssh_abduction.solver.sharing import Backbone
+from ssh_abduction.solver import Backbone, Solution, Status, theory_in
 from ssh_abduction.theory.theory import Theory
 
 

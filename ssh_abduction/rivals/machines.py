@@ -19,7 +19,7 @@ from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace, View
-from ssh_abduction.solver.steps.log import observation
+from ssh_abduction.solver import observation
 from ssh_abduction.theory.evidence.alike import are_alike
 from ssh_abduction.theory.theory import IN_TOLERANCE, Theory
 

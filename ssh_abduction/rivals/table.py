@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.maps import DState, SSHMap
-from ssh_abduction.solver.engines.doubts import Sort
-from ssh_abduction.solver.sharing import SORTS, Backbone, Shared
+from ssh_abduction.solver import SORTS, Backbone, Shared, Sort
 
 Ints: TypeAlias = NDArray[np.int32]
 Bools: TypeAlias = NDArray[np.bool_]

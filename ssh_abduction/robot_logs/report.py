@@ -20,7 +20,7 @@ from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.ladder import Rung
 from ssh_abduction.output.drawing import COLOURS, escaped, page, text
-from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver import Solution
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]

@@ -1,6 +1,145 @@
-"""Every minimal map of a trace."""
+"""Search for every minimal map of a trace. Other packages import the names of this module only.
 
-from ssh_abduction.solver.result import Bound, Progress, Seconds, Solution, Status
-from ssh_abduction.solver.search import Search, solve
+Each name is loaded when it is first used, so that importing `Solution` does not load clingo.
+"""
 
-__all__ = ["Bound", "Progress", "Search", "Seconds", "Solution", "Status", "solve"]
+from ssh_abduction import lazy_names
+
+TYPE_CHECKING = False
+
+if TYPE_CHECKING:
+    from ssh_abduction.solver.asp import facts, workers
+    from ssh_abduction.solver.asp.control import has_processors
+    from ssh_abduction.solver.asp.limits import POLL, LimitError, Stop, Watch, check_limit, resident_memory
+    from ssh_abduction.solver.asp.process import end_all, in_process
+    from ssh_abduction.solver.asp.rules import check_rules
+    from ssh_abduction.solver.engines.base import AT_ONCE, Cost, Task, cost_as_counted
+    from ssh_abduction.solver.engines.doubts import Sort
+    from ssh_abduction.solver.engines.framed import FramedEngine
+    from ssh_abduction.solver.front import Front, Point, fault_front
+    from ssh_abduction.solver.guesses.tree import Sketch
+    from ssh_abduction.solver.judging import InternalError, Judging
+    from ssh_abduction.solver.ranking import Ranking
+    from ssh_abduction.solver.recorded import theory_in
+    from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solution, Status, summary_of
+    from ssh_abduction.solver.search import Search, solve
+    from ssh_abduction.solver.sharing import SORTS, Backbone, Shared, Sharing, stretches
+    from ssh_abduction.solver.steps.certificate import RESTS_ON, Certificate
+    from ssh_abduction.solver.steps.log import Outcome, observation
+
+_HOMES = {  # module: the names that this package exports from it
+    "asp": (
+        "facts",
+        "workers",
+    ),
+    "asp.control": ("has_processors",),
+    "asp.limits": (
+        "POLL",
+        "LimitError",
+        "Stop",
+        "Watch",
+        "check_limit",
+        "resident_memory",
+    ),
+    "asp.process": (
+        "end_all",
+        "in_process",
+    ),
+    "asp.rules": ("check_rules",),
+    "engines.base": (
+        "AT_ONCE",
+        "Cost",
+        "Task",
+        "cost_as_counted",
+    ),
+    "engines.doubts": ("Sort",),
+    "engines.framed": ("FramedEngine",),
+    "front": (
+        "Front",
+        "Point",
+        "fault_front",
+    ),
+    "guesses.tree": ("Sketch",),
+    "judging": (
+        "InternalError",
+        "Judging",
+    ),
+    "ranking": ("Ranking",),
+    "recorded": ("theory_in",),
+    "result": (
+        "Bound",
+        "Level",
+        "Progress",
+        "Seconds",
+        "Solution",
+        "Status",
+        "summary_of",
+    ),
+    "search": (
+        "Search",
+        "solve",
+    ),
+    "sharing": (
+        "SORTS",
+        "Backbone",
+        "Shared",
+        "Sharing",
+        "stretches",
+    ),
+    "steps.certificate": (
+        "RESTS_ON",
+        "Certificate",
+    ),
+    "steps.log": (
+        "Outcome",
+        "observation",
+    ),
+}
+__all__ = [
+    "AT_ONCE",
+    "POLL",
+    "RESTS_ON",
+    "SORTS",
+    "Backbone",
+    "Bound",
+    "Certificate",
+    "Cost",
+    "FramedEngine",
+    "Front",
+    "InternalError",
+    "Judging",
+    "Level",
+    "LimitError",
+    "Outcome",
+    "Point",
+    "Progress",
+    "Ranking",
+    "Search",
+    "Seconds",
+    "Shared",
+    "Sharing",
+    "Sketch",
+    "Solution",
+    "Sort",
+    "Status",
+    "Stop",
+    "Task",
+    "Watch",
+    "check_limit",
+    "check_rules",
+    "cost_as_counted",
+    "end_all",
+    "facts",
+    "fault_front",
+    "has_processors",
+    "in_process",
+    "observation",
+    "resident_memory",
+    "solve",
+    "stretches",
+    "summary_of",
+    "theory_in",
+    "workers",
+]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -11,7 +11,7 @@ import time
 from functools import cached_property
 
 from ssh_abduction.checker.checker import AXIOMS, Violation, check, unchecked, violations
-from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
@@ -31,7 +31,7 @@ A_STEP = 5e-6
 UNSHOWN = frozenset({"one_place", "one_course", "one_heading", "gateway_heading"})
 
 
-class InternalError(SSHError):
+class InternalError(AbductionError):
     """A map that was found breaks an axiom: a defect of this program, and not of the trace."""
 
 

@@ -1,5 +1,6 @@
-"""Which axioms hold, where they stand, and which speed-ups they leave on."""
+"""Which axioms hold, where they are written, and which speed-ups they allow."""
 
+from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import CAUSAL, CHOICES, COUNTS, PRESETS, Count, Theory
 
-__all__ = ["CAUSAL", "CHOICES", "COUNTS", "PRESETS", "Count", "Theory"]
+__all__ = ["CAUSAL", "CHOICES", "COUNTS", "PRESETS", "Count", "Speedups", "Theory"]

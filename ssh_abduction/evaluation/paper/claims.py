@@ -28,8 +28,7 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.solver.engines.base import Cost
-from ssh_abduction.solver.search import solve
+from ssh_abduction.solver import Cost, solve
 from ssh_abduction.theory.theory import Theory
 
 

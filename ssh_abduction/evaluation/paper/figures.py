@@ -16,7 +16,7 @@ from perception.features import TellingFeatures
 from perception.recognition import LearningCurve
 from simulator.laser import BEARINGS
 from simulator.world import World
-from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.evaluation.paper.claims import Outcome
@@ -26,13 +26,13 @@ BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"
 
 
 def require_matplotlib() -> None:
-    """Raises SSHError where nothing can be drawn: to be asked before hours of work, not after."""
+    """Raises AbductionError where nothing can be drawn: to be asked before hours of work, not after."""
     try:
         importlib.import_module("matplotlib")
     except ImportError:
-        raise SSHError("plot: expected matplotlib to draw with, got none; pip install 'ssh-abduction[plot]'") from None
+        raise AbductionError("plot: expected matplotlib to draw with, got none; pip install 'ssh-abduction[plot]'") from None
     except Exception as error:  # of its settings, such as MPLBACKEND, which it reads when it is loaded
-        raise SSHError(f"plot: expected matplotlib to load, got {type(error).__name__}: {error}; mend its settings") from None
+        raise AbductionError(f"plot: expected matplotlib to load, got {type(error).__name__}: {error}; mend its settings") from None
 
 
 def _pyplot() -> Any:

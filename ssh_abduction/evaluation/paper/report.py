@@ -21,7 +21,7 @@ from simulator.robot import Body
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data import program
-from ssh_abduction.data.errors import SSHError
+from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
 from ssh_abduction.evaluation.paper import figures
 from ssh_abduction.evaluation.paper.claims import (
@@ -38,7 +38,7 @@ from ssh_abduction.evaluation.paper.claims import (
 )
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output.picture import svg
-from ssh_abduction.solver.asp import workers
+from ssh_abduction.solver import workers
 
 NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)  # metres
 SCALES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # times the spread that hill-climbing leaves
@@ -53,15 +53,15 @@ def reproduce(
     on_done: Callable[[str], None] = lambda _: None,
     on_table: Callable[[list[dict[str, Any]]], None] = lambda _: None,
 ) -> list[dict[str, Any]]:
-    """Run an experiment for all seeds, and write everything into a folder. Returns the table of claims. Raises SSHError.
+    """Run an experiment for all seeds, and write everything into a folder. Returns the table of claims. Raises AbductionError.
 
     on_done   is told what was done, `steps` times
     on_table  is given the table once all data is written, before anything is drawn: a picture that fails loses nothing
     """
     if name not in EXPERIMENTS:
-        raise SSHError(f"experiment: expected one of {', '.join(EXPERIMENTS)}, got {name!r}")
+        raise AbductionError(f"experiment: expected one of {', '.join(EXPERIMENTS)}, got {name!r}")
     if not seeds:
-        raise SSHError("seeds: expected at least one, got none; write 0-19")
+        raise AbductionError("seeds: expected at least one, got none; write 0-19")
     figures.require_matplotlib()
     folder.mkdir(parents=True, exist_ok=True)
     runs: list[Run] = []
@@ -104,7 +104,7 @@ def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int)
     numbered = [(number, work, task) for number, task in enumerate(tasks)]
     for answer in workers.answers(_done, numbered, processes, lambda: False, None, 0.0):
         if isinstance(answer, workers.Lost):
-            raise SSHError("process: expected an answer, got killed, as happens when memory runs out; take fewer --jobs")
+            raise AbductionError("process: expected an answer, got killed, as happens when memory runs out; take fewer --jobs")
         number, ready[number] = answer
         while turn in ready:
             result = ready.pop(turn)

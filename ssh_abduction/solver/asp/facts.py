@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 
-from ssh_abduction.data.maps import FAULTS, DState, Fault, Path, SSHMap
+from ssh_abduction.data.maps import FAULTS, DState, Fault, MapPath, SSHMap
 from ssh_abduction.data.odometry import in_words
 from ssh_abduction.data.trace import Action, Trace, View
 from ssh_abduction.solver.steps import frames
@@ -988,7 +988,7 @@ class PathReader:
             for i, dstate in along:
                 dstates[i] = dstate
         orders = ((path, [placed.number[p] for p in answer.order[h][::first]]) for h, (path, first) in faced.items())
-        paths = tuple(Path(path, tuple(order)) for path, order in orders)
+        paths = tuple(MapPath(path, tuple(order)) for path, order in orders)
         return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(placed.number))), paths)
 
     def _placed_at(self, at: dict[int, tuple[int, int]]) -> _Placed:
@@ -1068,7 +1068,7 @@ def _view(trace: Trace, step: int) -> str | int:
     return view
 
 
-def _paths(count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]) -> tuple[Path, ...]:
+def _paths(count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]) -> tuple[MapPath, ...]:
     """Paths with their places in order."""
     on: list[set[int]] = [set() for _ in range(count)]
     for s in dstates:
@@ -1078,7 +1078,7 @@ def _paths(count: int, dstates: Iterable[DState], before: Iterable[tuple[int, in
     for path, p, q in before:
         if p in on[path] and q in on[path]:
             pairs[path].append((p, q))
-    return tuple(Path(path, tuple(_in_order(found, pairs[path]))) for path, found in enumerate(on))
+    return tuple(MapPath(path, tuple(_in_order(found, pairs[path]))) for path, found in enumerate(on))
 
 
 def _in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:

@@ -28,7 +28,7 @@ from functools import partial
 
 from ssh_abduction.checker.gateways import Sight, headings
 from ssh_abduction.data.clock import look_at_clock
-from ssh_abduction.data.maps import DState, Path, SSHMap
+from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
@@ -288,7 +288,7 @@ class _Growing:
             dstates.append(
                 replace(s, id=new, place=places.setdefault(s.place, len(places)), path=path, direction=direction, heading=facing.get(old))
             )
-        made = tuple(Path(number, tuple(places[p] for p in self.orders[path][::faced])) for path, (number, faced) in paths.items())
+        made = tuple(MapPath(number, tuple(places[p] for p in self.orders[path][::faced])) for path, (number, faced) in paths.items())
         links = tuple(sorted((first[s], action, first[x]) for (s, action), x in self.links.items()))
         return SSHMap(tuple(first[label] for label in self.labels), tuple(dstates), links, tuple(places.values()), made)
 

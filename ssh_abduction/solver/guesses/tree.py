@@ -1,6 +1,7 @@
 """Makes a consistent map without a search: each step leads somewhere new, unless the axioms say where it leads.
 
->>> from ssh_abduction import Action, Step, Theory
+>>> from ssh_abduction import Theory
+>>> from ssh_abduction.data import Action, Step
 >>> from ssh_abduction.solver.guesses.tree import Sketch
 >>> sketch = Sketch(Step("end"), Theory(star="none"))
 >>> travel, around = Action("travel", "travel"), Action("around", "turn", "around")
@@ -28,7 +29,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from ssh_abduction.data.maps import DState, Path, SSHMap
+from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace, View
 from ssh_abduction.solver.steps.chart import QUARTERS
 from ssh_abduction.solver.steps.log import observation
@@ -290,6 +291,6 @@ class Sketch:
             )
             for i, s in enumerate(self._states)
         )
-        paths = tuple(Path(number, tuple(self._orders[path][::direction])) for path, (number, direction) in first.items())
+        paths = tuple(MapPath(number, tuple(self._orders[path][::direction])) for path, (number, direction) in first.items())
         excused = [sorted((first[h][0], first[g][0])) for h, g in self._excused]
         return SSHMap(labels, dstates, links, tuple(range(len(self._stars))), paths, tuple(sorted((h, g) for h, g in excused)))

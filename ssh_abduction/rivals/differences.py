@@ -22,8 +22,7 @@ from ssh_abduction.data.checks import a_list, a_text
 from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
 from ssh_abduction.rivals.table import NONE, Table
-from ssh_abduction.solver.engines.doubts import Sort
-from ssh_abduction.solver.sharing import stretches
+from ssh_abduction.solver import Sort, stretches
 
 Steps: TypeAlias = tuple[int, ...]
 Link: TypeAlias = tuple[int, str, int]

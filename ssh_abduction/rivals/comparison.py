@@ -1,7 +1,7 @@
 """What rival maps share, where they differ, and which steps decide between them.
 
 >>> from ssh_abduction import Trace, solve
->>> from ssh_abduction.rivals.compare import compare
+>>> from ssh_abduction.rivals.comparison import compare
 >>> found = compare(solve(Trace.load("examples/aces3-route.jsonl")))
 >>> print(found.sentence)
 4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ
@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.maps import Fault, SSHMap
-from ssh_abduction.rivals.difference import Difference, difference
+from ssh_abduction.rivals.differences import Difference, difference
 from ssh_abduction.rivals.factors import deciding, independent, options_of
 from ssh_abduction.rivals.listing import Listing, Maps
 from ssh_abduction.rivals.table import Bools, Table
-from ssh_abduction.solver.sharing import SORTS, Backbone, Shared, stretches
+from ssh_abduction.solver import SORTS, Backbone, Shared, stretches
 
 Matter: TypeAlias = Literal["faults", "dstates", "places", "paths", "courses"]
 
