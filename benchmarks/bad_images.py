@@ -50,12 +50,12 @@ class Unsure(BootstrapLearner):
 def learners() -> Iterator[tuple[str, BootstrapLearner]]:
     """What is compared: a row of the table each."""
     by = {name: ViewClusterer(by=name, random_state=0) for name in ("M", "trimmed")}
-    yield "no faults, M", BootstrapLearner(PLAIN, by["M"], limit=SECONDS)
-    yield "no faults, trimmed M", BootstrapLearner(PLAIN, by["trimmed"], limit=SECONDS)
-    yield "misread=1.5, M, confidence unused", Unsure(FAULTS, by["M"], limit=SECONDS)
-    yield "misread=1.5, M", BootstrapLearner(FAULTS, by["M"], limit=SECONDS)
-    yield "misread=1.5, trimmed M", BootstrapLearner(FAULTS, by["trimmed"], limit=SECONDS)
-    yield "misread=1.5, isolated images are noise (default)", BootstrapLearner(FAULTS, limit=SECONDS)
+    yield "no faults, M", BootstrapLearner(PLAIN, by["M"], time_limit=SECONDS)
+    yield "no faults, trimmed M", BootstrapLearner(PLAIN, by["trimmed"], time_limit=SECONDS)
+    yield "misread=1.5, M, confidence unused", Unsure(FAULTS, by["M"], time_limit=SECONDS)
+    yield "misread=1.5, M", BootstrapLearner(FAULTS, by["M"], time_limit=SECONDS)
+    yield "misread=1.5, trimmed M", BootstrapLearner(FAULTS, by["trimmed"], time_limit=SECONDS)
+    yield "misread=1.5, isolated images are noise (default)", BootstrapLearner(FAULTS, time_limit=SECONDS)
 
 
 def with_bad_images(trace: Trace, kind: str, seed: int) -> tuple[Trace, NDArray[np.intp]]:
@@ -109,7 +109,8 @@ def rows(world: str, tours: int, seeds: list[int], only: str) -> Iterator[str]:
     others = [simulate(World.named(world), 3, 1000 + seed) for seed in seeds]
     nobody = np.array([], np.intp)
     clean = [
-        found(BootstrapLearner(PLAIN, limit=SECONDS), drive, nobody, other).accuracy for drive, other in zip(drives, others, strict=True)
+        found(BootstrapLearner(PLAIN, time_limit=SECONDS), drive, nobody, other).accuracy
+        for drive, other in zip(drives, others, strict=True)
     ]
     for name, learner in learners():
         if only not in name:

@@ -65,7 +65,7 @@ def main() -> None:
             if tool.startswith(OURS):
                 end_after(limit * (1 + MARGIN) + 1, timer)
                 speedups = all_but(tool.removeprefix(OURS).removeprefix(WITHOUT))
-                search = Search(trace, theory, limit=limit, memory=int(SHARE * space), maps=1, speedups=speedups)
+                search = Search(trace, theory, time_limit=limit, memory_limit=int(SHARE * space), max_maps=1, speedups=speedups)
                 answer = search.solution(tuple(search))
             else:
                 end_after(limit, timer)

@@ -121,7 +121,7 @@ def found(trace: Trace, by: str) -> Found:
     truth = true_dstates(trace)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(by=by, random_state=0), limit=SECONDS)
+        learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(by=by, random_state=0), time_limit=SECONDS)
         try:
             learner.fit(trace)
         except (LearnerError, PerceptionError):
@@ -138,7 +138,7 @@ def _mended(trace: Trace, views: NDArray[np.intp], truth: NDArray[np.str_], doub
     for i in doubtful:
         alike = views[sure[truth[sure] == truth[i]]]
         views[i] = np.bincount(alike).argmax() if len(alike) else views[i]
-    solution = solve(trace.with_views(views.tolist()), VIEWS_ALONE, limit=SECONDS)
+    solution = solve(trace.with_views(views.tolist()), VIEWS_ALONE, time_limit=SECONDS)
     return bool(solution.maps) and one_to_one(np.array(solution.maps[0].labels), truth)
 
 

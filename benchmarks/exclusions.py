@@ -27,7 +27,7 @@ def far(walk: Walk, apart: int) -> list[tuple[int, int]]:
 def timed(walk: Walk, theory: Theory, limit: float) -> tuple[float, Solution]:
     """Seconds that it takes to find one minimal map, and the solution."""
     began = time.perf_counter()
-    solution = solve(walk.trace, theory, maps=1, limit=limit)
+    solution = solve(walk.trace, theory, max_maps=1, time_limit=limit)
     return time.perf_counter() - began, solution
 
 

@@ -203,7 +203,7 @@ def has_map(robot: Driven, actions: int, limit: float) -> bool:
     trace = robot.trace(actions)
     truth = tuple(robot.truth[: actions + 1])
     known = Known("", trace, truth, tuple(map(robot.world.place, truth)))
-    solution = solve(trace, robot.world.theory, limit=limit, maps=20)
+    solution = solve(trace, robot.world.theory, time_limit=limit, max_maps=20)
     return bool(solution.maps) and all(is_true(m, known) for m in solution.maps) and (solution.complete or share_all(solution))
 
 
@@ -226,7 +226,7 @@ def steps_to_map(robot: Driven, limit: float) -> int | None:
 def explorer(world: World, seed: int, most: int, limit: float, seconds: float = float("inf"), judged: bool = False) -> Record:
     """Until it says that it ends; until so many seconds of processor time are spent; or, if it is judged as it drives, until it has the map."""
     robot, missing = Driven(world), everything(states_of(world))
-    found = Explorer(robot, world.theory, margin=world.margin, limit=limit)
+    found = Explorer(robot, world.theory, margin=world.margin, time_limit=limit)
     began = time.process_time()
     goes_on = True
     while goes_on and len(robot.done) < most and time.process_time() - began < seconds:

@@ -149,7 +149,7 @@ def search(sender: Connection, case: Case, theory: Theory, limit: float) -> None
             explanations = [explained(ours.best, progress.cost.tenths)]
             sender.send({"status": "ok", "cpu": round(proven_at, 3), **judged(case, explanations, proven=True)})
 
-    ours = Search(case.walk.trace, theory, limit=limit, on_progress=on_progress)
+    ours = Search(case.walk.trace, theory, time_limit=limit, on_progress=on_progress)
     maps = tuple(ours)
     proven = ours.status is Status.OPTIMAL
     answer = judged(case, [explained(m, ours.cost.tenths) for m in maps if ours.cost], proven)

@@ -44,7 +44,7 @@ def main() -> None:
             start = next(iter(graph))
             tour = planar.drive(graph, start, next(iter(graph[start])), steps, random.Random(seed), noise=noise, landmarks=landmarks)
             began = time.process_time()
-            solution = solve(tour.trace, limit=options.limit, maps=50)
+            solution = solve(tour.trace, time_limit=options.limit, max_maps=50)
             seconds = time.process_time() - began
             found = f"{solution.cost.dstates}, {solution.cost.places}" if solution.cost else "–"
             right = sum(ssh_map.labels == tour.labels for ssh_map in solution.maps)

@@ -64,7 +64,7 @@ def measured(trace: Trace, theory: Theory, limit: float) -> tuple[float, float, 
     """Seconds of the processor, those of them in geometry, and whether the answer is proven."""
     with timed() as spent:
         began = time.process_time()
-        solution = solve(trace, theory, limit=limit)
+        solution = solve(trace, theory, time_limit=limit)
         return time.process_time() - began, spent[0], solution.status is Status.OPTIMAL
 
 

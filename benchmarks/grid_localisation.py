@@ -126,7 +126,7 @@ class Learnt:
     @classmethod
     def of(cls, scene: Scene, case: Case, seed: int) -> Learnt:
         explored = scene.explored(case.explored, seed)
-        learner = BootstrapLearner(None, ViewClusterer(random_state=0), limit=SECONDS)
+        learner = BootstrapLearner(None, ViewClusterer(random_state=0), time_limit=SECONDS)
         began = process_time()
         learner.fit(explored)
         return cls(learner, [str(step.truth["dstate"]) for step in explored], process_time() - began)

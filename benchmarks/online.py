@@ -48,7 +48,7 @@ def main() -> None:
     walk = maze(options.size, options.size, steps=options.steps, seed=options.seed, stars=True, odometry=odometry)
     trace = walk.trace
     first, *rest = trace.steps
-    mapper = OnlineMapper(first.view or "", star=first.star, odometry=odometry, limit=options.limit)
+    mapper = OnlineMapper(first.view or "", star=first.star, odometry=odometry, time_limit=options.limit)
     number: dict[object, int] = {}
     truth = tuple(number.setdefault(state, len(number)) for state in walk.truth)
     seconds: list[float] = []
@@ -68,7 +68,7 @@ def main() -> None:
         visited = len(set(walk.truth[: solution.steps]))
         sizes.append(solution.cost.dstates / visited if solution.cost else 0.0)
         if solution.steps in CHECKPOINTS:
-            anew = solve(trace.prefix(solution.steps), limit=options.anew).seconds.total if options.anew else 0.0
+            anew = solve(trace.prefix(solution.steps), time_limit=options.anew).seconds.total if options.anew else 0.0
             dstates = solution.cost.dstates if solution.cost else 0
             print(
                 f"{solution.steps:6} {solution.status.value:10} {dstates:8} {solution.bound.dstates or 0:6} {visited:8} {solution.count:5} "

@@ -176,7 +176,7 @@ def found(learnt: Trace, asked: Trace, features: str, clusterer: str) -> Found:
     truth, asked_truth = true_dstates(learnt), true_dstates(asked)
     made = Rotated(FEATURES[features])
     learner = BootstrapLearner(
-        VIEWS_ALONE, ViewClusterer(k_max=MOST_VIEWS, clusterer=CLUSTERERS[clusterer], random_state=0), limit=SECONDS, features=made
+        VIEWS_ALONE, ViewClusterer(k_max=MOST_VIEWS, clusterer=CLUSTERERS[clusterer], random_state=0), time_limit=SECONDS, features=made
     )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

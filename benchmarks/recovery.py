@@ -103,7 +103,7 @@ def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int 
     """What the mapper says on its way through a trace with one fault."""
     trace = case.walk.trace
     shown = min([*case.wrong, *case.misseen, *(t + 1 for t in case.jumps)])
-    mapper = OnlineMapper(trace.views[0], theory, star=trace.steps[0].star, limit=limit)
+    mapper = OnlineMapper(trace.views[0], theory, star=trace.steps[0].star, time_limit=limit)
     noticed = again = None
     right_again = False
     milliseconds = []

@@ -261,7 +261,7 @@ def main() -> None:
             views = ViewClusterer(random_state=0).fit(ReciprocalTransformer().fit_transform(images_of(run))).labels_
             trace = run.with_views(views.tolist())
             clustered = process_time()
-            solution = solve(trace, maps=0, limit=60)
+            solution = solve(trace, max_maps=None, time_limit=60)
             found = evaluate(solution.maps, trace) if solution.maps else None
             driven += 1
             places += bool(found and all(m.dstates_right and m.places_right for m in found.maps))

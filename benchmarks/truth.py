@@ -141,7 +141,7 @@ def told(name: str, trace: Trace) -> Known:
 def row(known: Known, theory: Theory, limit: float) -> tuple[str, bool, float]:
     """A row of the table, whether all minimal maps are true and proven minimal, and the seconds that it took."""
     began = time.perf_counter()
-    solution = solve(known.trace, theory, limit=limit)
+    solution = solve(known.trace, theory, time_limit=limit)
     seconds = time.perf_counter() - began
     right = [is_true(ssh_map, known) for ssh_map in solution.maps]
     all_true = bool(right) and all(right) and (solution.complete or share_all(solution))

@@ -84,7 +84,7 @@ def trace_of(text: str, openings: str, moved: list[tuple[float, float, float]] |
 
 
 def answer(trace: Trace, theory: Theory) -> Answer:
-    solution = solve(trace, theory, maps=0)
+    solution = solve(trace, theory, max_maps=None)
     assert solution.complete
     cost = solution.cost
     return (cost and (cost.dstates, cost.places, cost.paths)), solution.count

@@ -88,8 +88,8 @@ def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
     frame_after = data.draw(st.sampled_from([0.0, solver.FRAME_AFTER]), label="frame after")
     patches = {"FEW_STEPS": few_steps, "FRAME_AFTER": frame_after, "ONE_MORE": 0.0, "ONE_MORE_SHARE": 0.0}
     with patch.object(prefixes, "FIRST_PREFIX", first_prefix), patch.multiple(solver, **patches):
-        every = solve(trace, theory, maps=0, limit=LIMIT)
-        first = solve(trace, theory, maps=1, limit=LIMIT)
+        every = solve(trace, theory, max_maps=None, time_limit=LIMIT)
+        first = solve(trace, theory, max_maps=1, time_limit=LIMIT)
         assert counts is None or first.backbone is not None
     if counts is None:
         assert every.backbone is first.backbone is None
@@ -111,7 +111,7 @@ def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
 )
 def test_reasoning_from_one_map_says_what_the_whole_list_says(theory: Theory, count: int, shared: str) -> None:
     trace = Trace.load(ACES3)
-    every, first = solve(trace, theory, maps=0), solve(trace, theory, maps=1)
+    every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
     assert every.summary == f"{count} minimal maps: {shared}"
     assert first.summary == f"at least 1 minimal map (listing was stopped by the maps limit): {shared}"
     assert first.backbone == every.backbone
@@ -138,7 +138,7 @@ def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine:
     """32 maps that differ in dstates, too: found by a prefix of the readable encodings, or by labels that are settled before places and paths."""
     trace, theory = walk(TWO_BLOCKS, "a1", 60, 1), Theory(boundary="none", prefer=("dstates",))
     with patch.object(solver, "FRAME_AFTER", frame_after):
-        every, first = solve(trace, theory, maps=0), solve(trace, theory, maps=1)
+        every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
     assert first.rivals is not None
     assert type(first.rivals.engine) is engine
     assert every.count == 32
@@ -153,7 +153,7 @@ def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine:
 def test_a_maze_with_stars_is_reasoned_about_by_its_labels() -> None:
     """Seven maps in three labellings."""
     trace = maze(5, 5, steps=100, seed=1, stars=True).trace
-    every, first = solve(trace, maps=0), solve(trace, maps=1)
+    every, first = solve(trace, max_maps=None), solve(trace, max_maps=1)
     assert every.count == 7
     assert first.rivals is not None
     assert type(first.rivals.engine) is FramedEngine
@@ -163,7 +163,7 @@ def test_a_maze_with_stars_is_reasoned_about_by_its_labels() -> None:
 
 def test_what_is_listed_is_not_taken_for_proven_where_time_is_over() -> None:
     trace = Trace.load(ACES3)
-    search = Search(trace, Theory(star="none"), maps=2, reasons=True)
+    search = Search(trace, Theory(star="none"), max_maps=2, reasons=True)
     found = []
     for ssh_map in search:
         found.append(ssh_map)
@@ -176,7 +176,7 @@ def test_what_is_listed_is_not_taken_for_proven_where_time_is_over() -> None:
 
 def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end() -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=())
-    search = Search(rectangle(14), theory, maps=0, limit=1000, reasons=True)
+    search = Search(rectangle(14), theory, max_maps=None, time_limit=1000, reasons=True)
     with patch.object(Watch, "reserve_begins", 2.0):
         count = sum(1 for _ in search)
     solution = search.solution()
@@ -189,7 +189,7 @@ def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end()
 
 
 def test_what_is_known_goes_to_other_processes_and_what_asks_clingo_does_not() -> None:
-    solution = solve(Trace.load(ACES3), maps=1)
+    solution = solve(Trace.load(ACES3), max_maps=1)
     same = pickle.loads(pickle.dumps(solution))
     assert same == solution
     assert same.backbone is not None
@@ -199,7 +199,7 @@ def test_what_is_known_goes_to_other_processes_and_what_asks_clingo_does_not() -
 
 
 def test_while_the_robot_drives_the_backbone_is_that_of_the_maps_listed() -> None:
-    mapper = OnlineMapper("end", limit=None)
+    mapper = OnlineMapper("end", time_limit=None)
     for action, view in [("travel", "hall"), ("travel", "end"), ("around", "end"), ("travel", "hall")]:
         mapper.observe(action, view)
     assert mapper.solution.summary == "2 minimal maps: the same dstates and paths; the place of step 4 differs"
@@ -220,11 +220,11 @@ def test_while_the_robot_drives_the_backbone_is_that_of_the_maps_listed() -> Non
     ],
 )
 def test_the_summary_is_a_sentence(theory: Theory, maps: int, within: int, summary: str) -> None:
-    assert solve(Trace.load(ACES3), theory, maps=maps, within=within).summary == summary
+    assert solve(Trace.load(ACES3), theory, max_maps=maps, within=within).summary == summary
 
 
 def test_nothing_is_shared_where_no_map_is_proven_minimal() -> None:
-    solution = solve(Trace.load(ACES3), limit=1e-9)
+    solution = solve(Trace.load(ACES3), time_limit=1e-9)
     assert solution.status is Status.FEASIBLE
     assert solution.backbone is None
     assert solution.summary == "a map that is not proven minimal"
@@ -271,7 +271,7 @@ def test_of_many_pairs_so_many_are_printed_and_all_are_counted() -> None:
 
 def test_maps_that_differ_in_directions_along_paths_alone_are_told_apart() -> None:
     trace = maze(3, 3, steps=40, seed=4242, stars=True, follow=True, odometry=Odometry()).trace
-    solution = solve(trace, maps=0)
+    solution = solve(trace, max_maps=None)
     pairs = [(m, n) for m, n in combinations(solution.maps, 2) if [s.path for s in m.dstates] == [s.path for s in n.dstates]]
     assert pairs
     for one, other in pairs:

@@ -34,7 +34,7 @@ OURS = {"dstates", "bound", "proven", "prefix", "ground", "solve", "rules", "ato
 
 
 def fewest(trace: Trace) -> int:
-    cost = solve(trace, Theory.causal(), maps=1).cost
+    cost = solve(trace, Theory.causal(), max_maps=1).cost
     assert cost
     return cost.dstates
 

@@ -90,7 +90,7 @@ def test_an_unknown_answer_shows_the_best_map_of_the_first_steps() -> None:
 
 
 def test_to_show_a_solution_takes_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    solution = solve(ACES, maps=2)
+    solution = solve(ACES, max_maps=2)
     monkeypatch.setattr("ssh_abduction.solver.backbone.prove_backbone", lambda *_: pytest.fail("it searched"))
     assert "at least 2 minimal maps" in shown(solution)[1]
 

@@ -63,7 +63,7 @@ LONG: dict[str, Callable[[], object]] = {
     "checker": lambda: check(DRIVEN, MAP, USED),
     "gateways": lambda: check(GATEWAYS, sketched(GATEWAYS, IN_TOLERANCE, framed=False), IN_TOLERANCE),
     "displacements of two returns": lambda: Judging(driven(maze(3, 3, steps=80, seed=0).trace), USED).refusal(MAP),
-    "crossings": lambda: Planar.of(PLANAR).refuse(RING, solve(RING, maps=1).maps[0]),
+    "crossings": lambda: Planar.of(PLANAR).refuse(RING, solve(RING, max_maps=1).maps[0]),
     "fit": lambda: fit(DRIVEN, MAP),
 }
 
@@ -103,7 +103,7 @@ def test_there_is_a_map_when_the_time_is_over(steps: int, wrong: int, stars: boo
     """Though the checker refuses the sketches that take places for some seen before, as displacements are wrong."""
     trace = driven(maze(4, 4, steps=steps, seed=steps, stars=stars).trace, wrong)
     with patch.multiple(solver, OVERTIME=100.0):
-        solution = solve(trace, limit=1e-6)
+        solution = solve(trace, time_limit=1e-6)
     assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
     assert check(trace, solution.maps[0], solution.theory) == ()
 
@@ -113,7 +113,7 @@ def test_a_sketch_that_the_checker_refuses_is_not_the_last_one() -> None:
     theory = Theory.topological().resolve(trace)
     assert check(trace, sketched(trace, theory), theory)
     with patch.multiple(solver, OVERTIME=100.0), patch.object(candidates, "SKETCH_SHARE", 1.0):
-        assert solve(trace, limit=1e-6).maps
+        assert solve(trace, time_limit=1e-6).maps
 
 
 def test_no_sketch_takes_all_the_time() -> None:
@@ -127,7 +127,7 @@ def test_no_sketch_takes_all_the_time() -> None:
         raise over_time
 
     with patch.multiple(solver, OVERTIME=100.0), patch.object(candidates.Candidates, "_go_on_to_end", deaf):
-        assert solve(trace, limit=1e-6).status is Status.UNKNOWN
+        assert solve(trace, time_limit=1e-6).status is Status.UNKNOWN
     assert len(tried) == len(Sketch.all_of(trace.steps[0], Theory.topological().resolve(trace)))
 
 

@@ -164,7 +164,7 @@ def naive_differing(maps: Sequence[SSHMap]) -> dict[str, set[int]]:
 @given(st.data())
 def test_what_is_said_of_maps_is_so_in_the_explicit_list(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")
-    maps = solve(trace, data.draw(theories(trace), label="theory"), maps=60, limit=10).maps
+    maps = solve(trace, data.draw(theories(trace), label="theory"), max_maps=60, time_limit=10).maps
     if not maps:
         return
     if len(maps) > 1 and data.draw(st.booleans(), label="few"):  # any maps of one trace are compared, not only all minimal ones
@@ -198,7 +198,7 @@ def naive_groups(ssh_map: SSHMap, sort: Matter) -> set[tuple[int, ...]]:
 
 
 def test_maps_that_differ_in_places_alone() -> None:
-    solution = solve(Trace.load(ACES3), FREE_PLACES, maps=0)
+    solution = solve(Trace.load(ACES3), FREE_PLACES, max_maps=None)
     found = compare(solution)
     assert found.sentence == solution.summary == "102 minimal maps: the same dstates and paths; the places of steps 14–22 differ"
     assert found.variants == {"dstates": 1, "places": 102, "paths": 1, "courses": 1}
@@ -207,7 +207,7 @@ def test_maps_that_differ_in_places_alone() -> None:
 
 
 def test_maps_that_differ_in_paths_alone_say_which_stretches_are_one_path() -> None:
-    solution = solve(maze(5, 5, steps=100, seed=1, stars=True).trace, maps=0)
+    solution = solve(maze(5, 5, steps=100, seed=1, stars=True).trace, max_maps=None)
     maps = [m for m in solution.maps if m.labels == solution.maps[0].labels]
     found = compare(maps)
     assert len(maps) == 4
@@ -218,7 +218,7 @@ def test_maps_that_differ_in_paths_alone_say_which_stretches_are_one_path() -> N
 
 
 def test_independent_choices_are_factors() -> None:
-    solution = solve(Trace.load(ACES3), Theory(prefer=("dstates",)), maps=0)
+    solution = solve(Trace.load(ACES3), Theory(prefer=("dstates",)), max_maps=None)
     found = compare(solution)
     assert found.product == "68 = 2 x 34"
     holds_of(found, solution.maps)
@@ -254,7 +254,7 @@ def test_maps_of_all_kinds_are_compared_whatever_they_are_of() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_ids_do_not_depend_on_how_things_are_numbered(seed: int) -> None:
     rng = random.Random(seed)
-    maps = solve(Trace.load(ACES3), maps=0).maps
+    maps = solve(Trace.load(ACES3), max_maps=None).maps
     assert len({m.id for m in maps}) == len(maps)
     for ssh_map in maps:
         number, place, path = (rng.sample(range(n), n) for n in (len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths)))
@@ -309,7 +309,7 @@ def test_the_order_of_a_complete_list_is_the_same_with_any_number_of_threads(mon
 
         for module in (framed, naming):
             monkeypatch.setattr(module, "give_threads", give)
-        solution = solve(maze(5, 5, steps=100, seed=1, stars=True).trace, maps=0)
+        solution = solve(maze(5, 5, steps=100, seed=1, stars=True).trace, max_maps=None)
         assert solution.complete
         lists.append([m.id for m in solution.maps])
     assert len(lists[0]) == 7
@@ -318,7 +318,7 @@ def test_the_order_of_a_complete_list_is_the_same_with_any_number_of_threads(mon
 
 
 def test_a_list_is_in_order_whatever_order_maps_are_found_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    usual = solve(Trace.load(ACES3), FREE_PLACES, maps=0)
+    usual = solve(Trace.load(ACES3), FREE_PLACES, max_maps=None)
     found = searching.Search._found
 
     def shuffled(search: searching.Search) -> Iterator[SSHMap]:
@@ -327,14 +327,14 @@ def test_a_list_is_in_order_whatever_order_maps_are_found_in(monkeypatch: pytest
         return iter(maps)
 
     monkeypatch.setattr(searching.Search, "_found", shuffled)
-    again = solve(Trace.load(ACES3), FREE_PLACES, maps=0)
+    again = solve(Trace.load(ACES3), FREE_PLACES, max_maps=None)
     assert [m.id for m in again.maps] == [m.id for m in usual.maps]
     assert again.cost == usual.cost
 
 
 def test_the_map_that_closes_best_stays_first() -> None:
     trace = maze(3, 3, steps=40, seed=4242, stars=True, follow=True, odometry=None).trace
-    maps = solve(trace, maps=0).maps
+    maps = solve(trace, max_maps=None).maps
     fitted = [replace(m, fit=Fit(float(len(maps) - i), 3, 0.5)) for i, m in enumerate(maps)]
     from ssh_abduction.solver.ranking import in_order
 
@@ -365,7 +365,7 @@ def file_of(tmp_path: Path) -> Callable[..., Path]:
 
 def test_the_shell_prints_what_python_says(file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
     path = file_of(ACES3, "-n", "0")
-    solution = solve(Trace.load(ACES3), maps=0)
+    solution = solve(Trace.load(ACES3), max_maps=None)
     found = compare(solution)
     assert main(["compare", str(path)]) == 0
     assert capsys.readouterr().out.startswith(f"{solution.summary}\n  4 = 2 x 2: ")
@@ -398,24 +398,24 @@ def test_where_not_all_are_listed_the_backbone_says_what_all_share(
     assert not found.listed.proven
     assert found.shared == replace(compare(Listing.load(every)).shared, proven=True)
     assert found.unlisted
-    python = compare(solve(Trace.load(ACES3), maps=2))
+    python = compare(solve(Trace.load(ACES3), max_maps=2))
     assert python.shared == found.shared
 
 
 def test_a_search_that_was_stopped_says_as_far_as_was_found_out() -> None:
-    maps = solve(Trace.load(ACES3), maps=0).maps
+    maps = solve(Trace.load(ACES3), max_maps=None).maps
     listing = Listing(maps[:2], minimal=2, complete=False, stopped="time limit")
     assert compare(listing).sentence.endswith("as far as was found out: others may differ in more")
     assert compare(maps[:1]).sentence == "1 map"
 
 
 def test_causal_maps_and_maps_with_faults() -> None:
-    causal = solve(maze(5, 5, steps=60, seed=3).trace, Theory.causal(), maps=0)
+    causal = solve(maze(5, 5, steps=60, seed=3).trace, Theory.causal(), max_maps=None)
     found = compare(causal)
     assert set(found.variants) == {"dstates"}
     holds_of(found, causal.maps)
     seen = [f"v{t % 4}" if t != 9 else "v0" for t in range(14)]
-    faulty = solve(Trace.from_steps(seen, (["right", "travel"] * 7)[:13]), Theory.causal().replace(misread=0.5, slipped=0.5), maps=0)
+    faulty = solve(Trace.from_steps(seen, (["right", "travel"] * 7)[:13]), Theory.causal().replace(misread=0.5, slipped=0.5), max_maps=None)
     assert len({m.faults for m in faulty.maps}) > 1
     told = compare(faulty)
     holds_of(told, faulty.maps)
@@ -514,7 +514,7 @@ def test_json_streams_what_is_too_much_to_hold(monkeypatch: pytest.MonkeyPatch, 
     printed_by.cache_clear()
     monkeypatch.setattr(solving, "HELD", 2)
     streamed = json.loads(file_of(ACES3, "-n", "0").read_text())
-    assert [m["id"] for m in held["maps"]] == [m.id for m in solve(Trace.load(ACES3), maps=0).maps]
+    assert [m["id"] for m in held["maps"]] == [m.id for m in solve(Trace.load(ACES3), max_maps=None).maps]
     assert {m["id"] for m in streamed["maps"]} == {m["id"] for m in held["maps"]}
     assert streamed["count"] == held["count"] == len(streamed["maps"])
     printed_by.cache_clear()
@@ -529,7 +529,7 @@ def test_one_map_has_nothing_to_be_told_apart_from() -> None:
 def test_dstates_along_no_path_are_no_contradiction() -> None:
     """Steps that are one dstate in the maps listed only, and along no path: their paths are not one in any map."""
     trace = Trace.from_steps("bbaabaa", ["travel", "left", "left", "left", "around", "around"])
-    cut = compare(solve(trace, maps=2, limit=30))
+    cut = compare(solve(trace, max_maps=2, time_limit=30))
     assert cut.complete is False
     assert cut.shared.proven
-    assert cut.shared.sentence == compare(solve(trace, maps=0)).shared.sentence
+    assert cut.shared.sentence == compare(solve(trace, max_maps=None)).shared.sentence

@@ -33,7 +33,7 @@ def broken_traces(draw: st.DrawFn, most_steps: int = 6) -> Trace:
 
 def maps_of(trace: Trace, theory: Theory, speedups: Speedups) -> set[object]:
     with patch.object(search, "FEW_STEPS", 0):
-        found = Search(trace, theory, maps=0, speedups=speedups)
+        found = Search(trace, theory, max_maps=None, speedups=speedups)
         maps = list(found)
     assert found.complete
     assert all(check(trace, ssh_map, theory) == () for ssh_map in maps)
@@ -58,11 +58,11 @@ def test_maps_of_mended_traces_are_those_of_the_plain_encodings(data: st.DataObj
     theory = Theory(
         boundary="none", misread=data.draw(st.sampled_from([0.4, 1.5])), slipped=slipped, star="frame" if trace.has_stars else "none"
     )
-    plain = Search(trace, theory, maps=0, speedups=PLAIN)
+    plain = Search(trace, theory, max_maps=None, speedups=PLAIN)
     expected = {(*key(ssh_map), ssh_map.faults) for ssh_map in plain}
     assert plain.complete
     with patch.object(search, "FEW_STEPS", 0), patch.object(mending, "MOST_CAUSAL", 500):
-        mended = Search(trace, theory, maps=0)
+        mended = Search(trace, theory, max_maps=None)
         maps = list(mended)
     assert {(*key(ssh_map), ssh_map.faults) for ssh_map in maps} == expected
     assert mended.complete

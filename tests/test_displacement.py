@@ -208,7 +208,7 @@ def test_kilometres_are_noticed() -> None:
 def test_the_map_that_closes_best_comes_first_and_rivals_have_weights() -> None:
     trace = circuit(4, 6, 1.0)
     theory = Theory.causal().replace(prefer=(), joint=1, reject=1e-9)
-    solution = solve(trace, theory, maps=0)
+    solution = solve(trace, theory, max_maps=None)
     squares = [ssh_map.fit.chi2 for ssh_map in solution.maps if ssh_map.fit]
     assert len(squares) == solution.count > 1
     assert squares == sorted(squares)

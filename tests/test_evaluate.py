@@ -151,7 +151,7 @@ def test_names_make_no_difference(seed: int) -> None:
 @pytest.mark.parametrize("tour", TOURS)
 def test_a_map_is_isomorphic_to_itself_as_the_truth(tour: str) -> None:
     trace = drive(*TOURS[tour], stars=True)
-    solution = solve(trace, maps=3)
+    solution = solve(trace, max_maps=3)
     for ssh_map in solution.maps:
         at = [ssh_map.dstates[label] for label in ssh_map.labels]
         truths = [{"dstate": f"d{s.id}", "place": s.place, "path": s.path, "direction": s.direction} for s in at]
@@ -181,7 +181,7 @@ def test_the_notched_rectangle() -> None:
 
 def test_the_route_that_a_robot_drove_has_no_true_map_among_the_minimal_ones() -> None:
     trace = Trace.load(ACES)
-    found = evaluate(solve(trace, maps=0).maps, trace)
+    found = evaluate(solve(trace, max_maps=None).maps, trace)
     assert (len(found.maps), found.rank, found.steps) == (4, None, 23)
     assert (found.true_dstates, found.true_places, found.true_paths) == (22, 9, None)
     for each in found.maps:
@@ -338,7 +338,7 @@ def test_the_shell_prints_a_table(solved: str, capsys: pytest.CaptureFixture[str
 def test_the_shell_prints_json(solved: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", solved, ACES, "--json"]) == 0
     trace = Trace.load(ACES)
-    assert json.loads(capsys.readouterr().out) == evaluate(solve(trace, maps=0).maps, trace).to_dict()
+    assert json.loads(capsys.readouterr().out) == evaluate(solve(trace, max_maps=None).maps, trace).to_dict()
 
 
 def test_the_shell_says_which_map_is_true(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

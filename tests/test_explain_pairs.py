@@ -87,7 +87,7 @@ def test_without_any_one_axiom_the_rectangles_steps_may_be_one() -> None:
     assert derivation is not None
     for dropped in (None, *derivation.axioms):
         theory = only(Theory(same=[(0, 4)]), {*derivation.axioms, "asserted"} - {dropped})
-        solution = solve(RECTANGLE.prefix(5), theory, limit=100, maps=1)
+        solution = solve(RECTANGLE.prefix(5), theory, time_limit=100, max_maps=1)
         assert solution.status is (Status.UNSATISFIABLE if dropped is None else Status.OPTIMAL)
 
 
@@ -112,7 +112,7 @@ def compare(trace: Trace, theory: Theory, first: int, second: int) -> PairExplan
     consistent = [labels[first] == labels[second] for (labels, *rest), _ in consistent_maps(trace, theory) if allows((labels, *rest))]  # type: ignore[arg-type]
     _, minimal = minimal_maps(trace, theory, allows)
     ones = [labels[first] == labels[second] for labels, *_ in minimal]
-    explanation = explain_pair(trace, first, second, theory, limit=100, maps=0)
+    explanation = explain_pair(trace, first, second, theory, time_limit=100, max_maps=None)
     if not consistent:
         assert explanation.verdict is Verdict.NO_MAP
     elif len(set(consistent)) == 1:
@@ -170,14 +170,14 @@ def test_what_a_rival_costs_that_lost() -> None:
         "steps 0 and 8 are one dstate in every minimal map",
         "the best map with step 0 ≠ step 8 has 9 dstates, not 8",
     )
-    other = solve(RECTANGLE, different=[(0, 8)], maps=1)
+    other = solve(RECTANGLE, different=[(0, 8)], max_maps=1)
     assert other.cost == explanation.different.cost
 
 
 def test_rivals_that_disagree_are_counted() -> None:
     """Turned back, travel may stop at the place before, or skip it (G1 of docs/theory.md)."""
     trace = Trace.from_steps("batbbb".replace("t", "b"), ["travel", "travel", "around", "travel", "travel"])
-    maps = solve(trace, maps=0).maps
+    maps = solve(trace, max_maps=None).maps
     pairs = [(i, j) for j in range(len(trace)) for i in range(j) if len({m.labels[i] == m.labels[j] for m in maps}) == 2]
     for i, j in pairs:
         explanation = explain_pair(trace, i, j)
@@ -225,7 +225,7 @@ def test_nothing_is_explained_of_a_trace_without_a_map() -> None:
 
 
 def test_a_limit_leaves_what_is_known() -> None:
-    explanation = explain_pair(RECTANGLE, 3, 399, limit=0.001)
+    explanation = explain_pair(RECTANGLE, 3, 399, time_limit=0.001)
     assert explanation.verdict is Verdict.UNKNOWN
     assert explanation.stopped == "time limit"
     assert not explanation.proven

@@ -79,7 +79,7 @@ def partition(names: Collection[Any]) -> list[int]:
 )
 def test_streets_are_known_when_it_is_done(world: Streets, start: str, margin: int) -> None:
     robot = Streetwalker(world, start, "E")
-    found = Explorer(robot, margin=margin, limit=None).explore(200)
+    found = Explorer(robot, margin=margin, time_limit=None).explore(200)
     assert (found.ending, found.is_unique, found.is_true) == ("done", True, True)
     assert found.steps == len(robot.done)
     assert set(robot.been) == {(place, heading) for place in world for heading in range(4)}
@@ -95,11 +95,11 @@ def test_what_is_unique_is_what_solve_lists() -> None:
         chance = random.Random(seed)
         ends = {s: {action: chance.randrange(6) for action in ("p", "q")} for s in range(6)}
         robot = Machine("aabbaa", ends)
-        explorer = Explorer(robot, Theory.causal(), margin=0, limit=None)
+        explorer = Explorer(robot, Theory.causal(), margin=0, time_limit=None)
         been = [0]
         while explorer.step():
             been.append(robot.at)
-            listed = solve(explorer.trace, Theory.causal(), maps=0).maps
+            listed = solve(explorer.trace, Theory.causal(), max_maps=None).maps
             found = explorer.result
             assert found.is_unique == (len({m.labels for m in listed}) == 1)
             assert found.is_true == ([partition(m.labels) for m in listed] == [partition(been)])
@@ -108,7 +108,7 @@ def test_what_is_unique_is_what_solve_lists() -> None:
 
 
 def test_steps_that_are_spent_are_said() -> None:
-    found = Explorer(Streetwalker(RING, "a", "E", told=False), limit=None).explore(3)
+    found = Explorer(Streetwalker(RING, "a", "E", told=False), time_limit=None).explore(3)
     assert (found.steps, found.ending, found.is_true) == (3, "steps", None)
     assert "its steps are spent" in found.sentence
 
@@ -116,15 +116,15 @@ def test_steps_that_are_spent_are_said() -> None:
 def test_rivals_that_nothing_tells_apart_are_said() -> None:
     # The robot is at the last state, which may be 0 or 2: p would tell, and cannot be done there.
     one_way = {0: {"p": 1}, 1: {"n": 2}, 2: {"p": 3}, 3: {"n": 4}, 4: {}}
-    explorer = Explorer(Machine("axaza", one_way), Theory.causal(), limit=None)
+    explorer = Explorer(Machine("axaza", one_way), Theory.causal(), time_limit=None)
     found = explorer.explore(50)
     assert (found.steps, found.ending, found.is_unique, found.is_true) == (4, "inseparable", False, False)
-    assert len(solve(explorer.trace, Theory.causal(), maps=0)) == found.solution.count > 1
+    assert len(solve(explorer.trace, Theory.causal(), max_maps=None)) == found.solution.count > 1
     assert "not unique" in found.sentence
 
 
 def test_the_map_of_a_world_that_hides_its_states_is_not_true() -> None:
-    blind = Explorer(Machine("aaa", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 0}}), Theory.causal(), limit=None).explore(50)
+    blind = Explorer(Machine("aaa", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 0}}), Theory.causal(), time_limit=None).explore(50)
     assert (blind.ending, blind.is_unique, blind.is_true) == ("done", True, False)
     assert "not true" in blind.sentence
 
@@ -133,14 +133,14 @@ def test_a_margin_finds_what_the_fewest_dstates_hide() -> None:
     found = {}
     for margin in (0, 2):
         ring = Machine("abbc", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 3}, 3: {"on": 0}})
-        found[margin] = Explorer(ring, Theory.causal(), margin=margin, limit=None).explore(50)
+        found[margin] = Explorer(ring, Theory.causal(), margin=margin, time_limit=None).explore(50)
     assert {margin: (said.ending, said.is_true) for margin, said in found.items()} == {0: ("done", False), 2: ("done", True)}
     assert found[0].steps == 2  # after a, b, b it takes the last two for one
     assert found[2].steps >= 4
 
 
 def test_a_rival_with_more_dstates_that_nothing_tells_apart_is_said() -> None:
-    found = Explorer(Machine("abab", {s: {"on": (s + 1) % 4} for s in range(4)}), Theory.causal(), limit=None).explore(50)
+    found = Explorer(Machine("abab", {s: {"on": (s + 1) % 4} for s in range(4)}), Theory.causal(), time_limit=None).explore(50)
     assert (found.ending, found.is_unique, found.is_true) == ("inseparable", True, False)
     assert found.rival is not None
     assert (len(found.solution.maps[0].dstates), len(found.rival.dstates)) == (2, 4)
@@ -156,7 +156,7 @@ class Crooked(Streetwalker):
 
 
 def test_no_map_is_said() -> None:
-    explorer = Explorer(Crooked(TEE, "W", "E", told=False), limit=None)
+    explorer = Explorer(Crooked(TEE, "W", "E", told=False), time_limit=None)
     found = explorer.explore(10)
     assert (found.ending, found.is_unique, found.solution.status) == ("contradicted", False, Status.UNSATISFIABLE)
     assert solve(explorer.trace).status is Status.UNSATISFIABLE
@@ -164,7 +164,7 @@ def test_no_map_is_said() -> None:
 
 
 def test_a_step_goes_on_where_exploring_was_left() -> None:
-    whole, parts = (Explorer(Streetwalker(CORRIDOR, "a", "E"), margin=0, limit=None) for _ in range(2))
+    whole, parts = (Explorer(Streetwalker(CORRIDOR, "a", "E"), margin=0, time_limit=None) for _ in range(2))
     whole.explore(100)
     while parts.explore(1).ending == "steps":
         pass
@@ -184,7 +184,7 @@ class Nothing(Machine):
     [
         (lambda robot: Explorer(robot, margin=-1), TraceError, "margin: expected a number of dstates, 0 or more, got -1"),
         (lambda robot: Explorer(robot, margin=float("nan")), TraceError, "margin: expected a number of dstates"),
-        (lambda robot: Explorer(robot, limit=float("nan")), AbductionError, "limit"),
+        (lambda robot: Explorer(robot, time_limit=float("nan")), AbductionError, "limit"),
         (lambda robot: Explorer(robot, Theory.causal().replace(misread=1)), TheoryError, "theory: expected one without faults"),
         (lambda robot: Explorer(Nothing("a", {0: {}})), TraceError, "look: expected a Step with a view, got None"),
         (lambda robot: Explorer(robot).explore(-1), TraceError, "steps: expected a number of actions, 0 or more, got -1"),
@@ -197,6 +197,6 @@ def test_bad_input_is_refused(build: Any, error: type[AbductionError], message: 
 
 
 def test_a_robot_that_can_do_nothing_is_done_at_once() -> None:
-    found = Explorer(Machine("a", {0: {}}), limit=None).explore(10)
+    found = Explorer(Machine("a", {0: {}}), time_limit=None).explore(10)
     assert isinstance(found, Exploration)
     assert (found.steps, found.ending, found.is_unique, found.is_true) == (0, "done", True, True)

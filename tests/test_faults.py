@@ -99,7 +99,7 @@ def told(ssh_map: SSHMap) -> Told:
 def test_causal_maps_with_faults_are_those_of_brute_force(trace: Trace, misread: float, slipped: float, names: bool) -> None:
     """By names and by the readable encoding. A cost of whole dstates makes ties."""
     theory = Theory.causal().replace(misread=misread, slipped=slipped)
-    solution = solve(trace, theory, maps=0, speedups=Speedups() if names else Speedups.without("names"))
+    solution = solve(trace, theory, max_maps=None, speedups=Speedups() if names else Speedups.without("names"))
     cost, expected = cheapest(trace, round(10 * misread), round(10 * slipped))
     assert solution.complete
     assert solution.cost is not None
@@ -118,7 +118,7 @@ def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) 
         patch.multiple(faulty, FEW=data.draw(st.sampled_from([2, 9])), AT_FIRST=2, AROUND=0, PLACES=1, NAMES=1, MORE_NAMES=1),
         patch.object(search, "FEW_STEPS", 0),
     ):
-        solution = solve(trace, theory, maps=0)
+        solution = solve(trace, theory, max_maps=None)
     cost, expected = cheapest(trace, round(10 * theory.misread), round(10 * theory.slipped))
     assert solution.cost is not None
     assert solution.cost.tenths == cost
@@ -145,7 +145,7 @@ def test_topological_maps_are_those_of_corrected_traces(trace: Trace, misread: f
         if cost == best:
             expected |= seen
     faulty = theory.replace(misread=misread)
-    solution = solve(trace, faulty, maps=0)
+    solution = solve(trace, faulty, max_maps=None)
     found = {(key(m), tuple(m.dstates[s].view for s in m.labels)) for m in solution.maps}
     assert solution.complete
     assert (solution.cost is None) == (best is None)
@@ -191,7 +191,7 @@ def test_many_faults_of_a_long_trace_are_proven(kind: str) -> None:
     for t in wrong if kind == "misread" else ():
         seen[t] = "v3" if seen[t] != "v3" else "v2"
     trace = Trace.from_steps(seen, ["right", "travel"] * 599 + ["right"])
-    solution = solve(trace, Theory.causal().replace(**{kind: 1.5}), maps=1)
+    solution = solve(trace, Theory.causal().replace(**{kind: 1.5}), max_maps=1)
     assert solution.status is Status.OPTIMAL
     assert solution.cost is not None
     assert (solution.cost.dstates, len(solution.maps[0].faults)) == (8, 12)
@@ -370,7 +370,7 @@ def test_the_front_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_a_limit_leaves_a_map_and_a_bound() -> None:
     walk, _, _ = faulty_machine(20, 8, steps=300, seed=1, wrong=3)
-    solution = solve(walk.trace, Theory.causal().replace(misread=1.5), limit=0.3)
+    solution = solve(walk.trace, Theory.causal().replace(misread=1.5), time_limit=0.3)
     assert solution.status in (Status.FEASIBLE, Status.OPTIMAL)
     assert solution.cost is not None
     assert (solution.bound.tenths or 0) <= solution.cost.tenths

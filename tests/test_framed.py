@@ -102,7 +102,7 @@ def plainly_charted(engine: FramedEngine, size: int, before: FramedChart | None 
 @given(framed_traces(), framed_theories(), st.sets(st.sampled_from(SPEEDUPS)), st.data())
 def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off: set[str], data: st.DataObject) -> None:
     """With prefixes, cores and what is told in one go so small that all of it happens on short traces; and with any speed-ups off."""
-    expected = solve(trace, theory, maps=0, speedups=PLAIN)
+    expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, engine.FIRST_PREFIXES]), label="first prefixes")
     cores = {
         "AT_A_TIME": data.draw(st.sampled_from([1, same.AT_A_TIME]), label="at a time"),
@@ -135,7 +135,7 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         patch.object(FramedEngine, "_charted", charted),
         patch.object(engine.Task, "has_processors", processors),
     ):
-        search = Search(trace, theory, maps=0, speedups=Speedups.without(off))
+        search = Search(trace, theory, max_maps=None, speedups=Speedups.without(off))
         maps = tuple(search)
     found = search.solution(maps)
     assert isinstance(search._prefixes.engine, FramedEngine)
@@ -154,7 +154,7 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
 @given(framed_traces(), framed_theories(), st.integers(0, 20))
 def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: Theory, sweeps: int) -> None:
     """From a guess of any quality. Names that do not fit a frame, or have no paths, are no maps; and clingo may need more names than it had."""
-    expected = solve(trace, theory, maps=0, speedups=PLAIN)
+    expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     with (
         patch.object(solver, "FEW_STEPS", 0),
         patch.multiple(framed, SOON=-1.0, Beside=Before, MANY_DSTATES=sweeps % 2),
@@ -165,7 +165,7 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: The
         patch.object(FramedEngine, "_named_at", always_named_at),
         patch.object(FramedEngine, "_charted", plainly_charted),
     ):
-        search = Search(trace, theory, maps=0, speedups=Speedups.without("processes"))
+        search = Search(trace, theory, max_maps=None, speedups=Speedups.without("processes"))
         maps = tuple(search)
     found = search.solution(maps)
     assert found.status is expected.status
@@ -184,7 +184,7 @@ def test_a_limit_ends_the_search_beside(limit: float) -> None:
     trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(400)
     before = set(threading.enumerate())
     with patch.object(framed, "SOON", 0.0), patch.object(engine.Task, "has_processors", True):
-        search = Search(trace, Theory.topological(), limit=limit)
+        search = Search(trace, Theory.topological(), time_limit=limit)
         maps = tuple(search)
     solution = search.solution(maps)
     assert set(threading.enumerate()) <= before
@@ -199,13 +199,13 @@ def test_a_limit_ends_the_search_beside(limit: float) -> None:
 def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, seed: int) -> None:
     """There are several in these mazes, most of which have no paths."""
     walk = maze(side, side, steps=steps, seed=seed, stars=True)
-    expected = solve(walk.trace, Theory.topological(), maps=0, speedups=Speedups.without("annealed"))
+    expected = solve(walk.trace, Theory.topological(), max_maps=None, speedups=Speedups.without("annealed"))
     with (
         patch.multiple(framed, SOON=-1.0, Beside=Before),
         patch.object(engine.Task, "has_processors", True),
         patch.object(FramedEngine, "_named_at", always_named_at),
     ):
-        found = solve(walk.trace, Theory.topological(), maps=0)
+        found = solve(walk.trace, Theory.topological(), max_maps=None)
     assert found.status is Status.OPTIMAL
     assert found.bound == expected.bound
     assert set(found.maps) == set(expected.maps)
@@ -229,10 +229,10 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(trace: Trace, the
         ),
         patch.object(FramedEngine, "_charted", charted),
     ):
-        mapper = OnlineMapper(first.view or "", theory, star=first.star, limit=None, maps=0)
+        mapper = OnlineMapper(first.view or "", theory, star=first.star, time_limit=None, max_maps=None)
         for i, (action, step) in enumerate(zip(trace.actions, rest, strict=True)):
             answer = mapper.observe(action, step.view or "", star=step.star)
-            expected = solve(trace.prefix(i + 2), theory.of_steps(0, i + 2), maps=0, speedups=PLAIN)
+            expected = solve(trace.prefix(i + 2), theory.of_steps(0, i + 2), max_maps=None, speedups=PLAIN)
             assert answer.status is expected.status
             assert set(answer.maps) == set(expected.maps)
             assert answer.count == expected.count
@@ -245,11 +245,11 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
     first, *rest = trace.steps
     paths = set()
     with patch.multiple(same, GROWN=100, MANY=1, AT_A_TIME=5), patch.object(solver, "FEW_STEPS", 10):
-        mapper = OnlineMapper(first.view or "", star=first.star, limit=None, maps=0)
+        mapper = OnlineMapper(first.view or "", star=first.star, time_limit=None, max_maps=None)
         for i, (action, step) in enumerate(zip(trace.actions, rest, strict=True)):
             answer = mapper.observe(action, step.view or "", star=step.star)
             if i % 5 == seed or i == len(rest) - 1:
-                expected = solve(trace.prefix(i + 2), maps=0, speedups=Speedups.without("sides"))
+                expected = solve(trace.prefix(i + 2), max_maps=None, speedups=Speedups.without("sides"))
                 assert (answer.cost, answer.bound.dstates, answer.complete) == (expected.cost, expected.bound.dstates, True)
                 assert set(answer.maps) == set(expected.maps)
             engine = mapper._search and mapper._search._prefixes.engine
@@ -263,10 +263,10 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
 def test_each_speedup_off_alone(seed: int) -> None:
     """On walks long enough for cores, for visits that have to be told to be transitive, and for maps that are found nearby."""
     trace = maze(2, 2, steps=45, seed=seed, stars=True).trace
-    expected = solve(trace, Theory.topological(), maps=0, speedups=Speedups.without("names"))
+    expected = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without("names"))
     for off in ("", "clique", "core_guided", "sides"):
         with patch.multiple(same, MANY=1, AT_A_TIME=5):
-            found = solve(trace, Theory.topological(), maps=0, speedups=Speedups.without(off))
+            found = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without(off))
         assert set(found.maps) == set(expected.maps), off
         assert found.cost == expected.cost, off
         assert found.bound.dstates == expected.bound.dstates, off
@@ -296,7 +296,7 @@ def test_pairs_that_are_too_many_are_not_listed() -> None:
     chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
     assert chart.fitting[-1] == len(chart.fits(range(len(chart.stars)))) > 50
     with patch.object(same, "SECONDS_A_PAIR", 1000.0), patch.object(FramedChart, "fits", side_effect=AssertionError):
-        solution = solve(trace, limit=100)
+        solution = solve(trace, time_limit=100)
     assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
     assert check(trace, solution.maps[0], solution.theory) == ()
 
@@ -368,20 +368,20 @@ def test_pinned_stretches_leave_all_maps(seed: int, pinned: int, stretches: int)
         return found
 
     with patch.object(paths_module, "pairwise_distinct", rivals):
-        maps = solve(trace, maps=0).maps
+        maps = solve(trace, max_maps=None).maps
     assert any((len(found), len(among)) == (pinned, stretches) for found, among in given)
     assert len(maps) > 1
-    assert set(maps) == set(solve(trace, maps=0, speedups=Speedups.without("clique")).maps)
+    assert set(maps) == set(solve(trace, max_maps=None, speedups=Speedups.without("clique")).maps)
 
 
 def test_what_is_not_told_beforehand_is_found() -> None:
     """Every answer is refused until clingo was told what order and sides forbid; the maps are the same."""
     walk = maze(2, 2, steps=60, seed=1, stars=True)
-    expected = solve(walk.trace, Theory.topological(), maps=0)
+    expected = solve(walk.trace, Theory.topological(), max_maps=None)
     for off, kind, asked in (("", FramedSides, "say_of_path"), ("sides", FramedEngine, "_clashing")):
         finding = patch.object(kind, asked, autospec=True, side_effect=getattr(kind, asked))
         with patch.object(FramedEngine, "_charted", plainly_charted), finding as found:
-            maps = solve(walk.trace, Theory.topological(), maps=0, speedups=Speedups.without(off)).maps
+            maps = solve(walk.trace, Theory.topological(), max_maps=None, speedups=Speedups.without(off)).maps
         assert found.called
         assert set(maps) == set(expected.maps)
 
@@ -451,7 +451,7 @@ def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
 def test_a_maze_half_explored_is_mapped() -> None:
     """Few views tell little: order and sides have to. Some dstates have no paths though no single path shows it."""
     trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(150)
-    solution = solve(trace, Theory.topological(), maps=3)
+    solution = solve(trace, Theory.topological(), max_maps=3)
     assert solution.status is Status.OPTIMAL
     assert solution.cost
     assert (solution.cost.dstates, solution.cost.paths) == (53, 7)
@@ -490,7 +490,7 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
 def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
     """Else the time that is kept for any map would be spent on the engine of a shorter prefix, and its map be taken for the whole trace's."""
     walk = maze(3, 3, steps=120, seed=1, stars=True)
-    search = Search(walk.trace, Theory.topological(), limit=100)
+    search = Search(walk.trace, Theory.topological(), time_limit=100)
     engine = search._prefixes.engine
     engine.grow(40)
     with patch.object(engine._visits, "_charted", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
@@ -506,13 +506,13 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
 def test_ctrl_c_in_the_last_part_of_the_time_leaves_no_engine_to_go_on_with() -> None:
     """Perhaps clingo was told half of a core: what it would say then of the longer trace may be wrong."""
     trace = maze(3, 3, steps=80, seed=1, stars=True).trace
-    search = Search(trace.prefix(70), Theory.topological(), limit=100)
+    search = Search(trace.prefix(70), Theory.topological(), time_limit=100)
     with patch.object(Prefixes, "minimise", side_effect=[LimitError("time limit"), KeyboardInterrupt]):
         assert [check(search.trace, ssh_map, search.theory) for ssh_map in search] == [()]
     assert search.stopped == "interrupted"
-    later = Search(trace, Theory.topological(), maps=0, after=search)
+    later = Search(trace, Theory.topological(), max_maps=None, after=search)
     assert later._prefixes.engine is not search._prefixes.engine
-    assert set(later) == set(solve(trace, maps=0).maps)
+    assert set(later) == set(solve(trace, max_maps=None).maps)
 
 
 def test_an_error_leaves_no_engine_to_go_on_with() -> None:
@@ -529,12 +529,12 @@ def test_an_error_leaves_no_engine_to_go_on_with() -> None:
 def test_maps_of_a_known_cost_are_listed_for_the_whole_trace() -> None:
     """A shorter prefix has maps with fewer dstates, and those alone would be listed."""
     trace = maze(3, 3, steps=70, seed=44, stars=True).trace
-    first = Search(trace, Theory.topological(), maps=1)
+    first = Search(trace, Theory.topological(), max_maps=1)
     known = next(iter(first))
     first._known.stopped = "interrupted"
-    again = Search(trace, Theory.topological(), maps=0, after=first, minimal=known)
+    again = Search(trace, Theory.topological(), max_maps=None, after=first, minimal=known)
     assert not again.prefix
-    assert set(again) == set(solve(trace, maps=0).maps)
+    assert set(again) == set(solve(trace, max_maps=None).maps)
     assert again.prefix == len(trace)
 
 
@@ -613,7 +613,7 @@ def node_labels(ssh_map: SSHMap, chart: FramedChart) -> list[int]:
 @given(framed_traces(), framed_theories(), st.data())
 def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: Theory, data: st.DataObject) -> None:
     """So merging by evidence may keep to it."""
-    for ssh_map in solve(trace, theory, maps=3, speedups=PLAIN).maps:
+    for ssh_map in solve(trace, theory, max_maps=3, speedups=PLAIN).maps:
         asked = framed_engine(trace, theory)
         chart = asked._chart
         labels = node_labels(ssh_map, chart)
@@ -710,7 +710,7 @@ def test_labels_that_take_too_long_to_try_are_left() -> None:
     """Where no separate paths fit them, and there is no time to ground all; the search goes on."""
     walk = maze(3, 3, steps=200, seed=0, stars=True)
     asked = framed_engine(walk.trace, Theory.topological())
-    labels = node_labels(solve(walk.trace, Theory.topological(), maps=1).maps[0], asked._chart)
+    labels = node_labels(solve(walk.trace, Theory.topological(), max_maps=1).maps[0], asked._chart)
 
     def known() -> tuple[list[Found], bool | None]:
         found = []

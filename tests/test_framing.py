@@ -53,7 +53,7 @@ def test_maps_with_frames_are_maps_of_the_theory(data: st.DataObject) -> None:
     assert costs == sorted(costs, reverse=True)
     if not costs or theory.prefer[:1] != ("dstates",):
         return
-    assert costs[-1] >= len(solve(trace, theory, maps=1).maps[0].dstates)
+    assert costs[-1] >= len(solve(trace, theory, max_maps=1).maps[0].dstates)
 
 
 @settings(max_examples=8)
@@ -63,9 +63,9 @@ def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
     theory = data.draw(theories(trace), label="theory")
     first = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
-    expected = solve(trace, theory, maps=0, speedups=Speedups.without(SPEEDUPS))
+    expected = solve(trace, theory, max_maps=None, speedups=Speedups.without(SPEEDUPS))
     with patch.multiple(solver, FRAME_AFTER=-1.0, FEW_STEPS=0), patch.object(prefixes, "FIRST_PREFIX", first):
-        found = solve(trace, theory, maps=0, speedups=Speedups.without("names"))
+        found = solve(trace, theory, max_maps=None, speedups=Speedups.without("names"))
     assert found.status is expected.status
     assert found.complete
     assert set(found.maps) == set(expected.maps)
@@ -90,7 +90,7 @@ def test_a_maze_without_stars_has_a_small_map_before_the_proof(theory: Theory) -
 
 def test_a_maze_of_loops_has_a_map_smaller_than_a_sketch() -> None:
     trace = maze(3, 3, steps=400, seed=1, loops=0.5).trace
-    sketched = solve(trace, limit=1e-9)
+    sketched = solve(trace, time_limit=1e-9)
     with patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, StageTimeError, KeyboardInterrupt]):
         found = solve(trace)
     assert found.cost
@@ -108,9 +108,9 @@ def test_listing_is_not_paused() -> None:
         yield from listed(self)
 
     with patch.object(Prefixes, "minimal_maps", slowly):
-        solution = solve(trace, maps=0)
+        solution = solve(trace, max_maps=None)
     assert solution.complete
-    assert set(solution.maps) == set(solve(trace, maps=0, speedups=Speedups.without("framing")).maps)
+    assert set(solution.maps) == set(solve(trace, max_maps=None, speedups=Speedups.without("framing")).maps)
 
 
 @pytest.mark.parametrize("theory", [Theory.topological(), Theory(next_place=True), Theory(all_on_paths=True)], ids=["", "next", "on paths"])
@@ -129,7 +129,7 @@ def test_a_sketch_with_frames_is_smaller(theory: Theory) -> None:
 def test_while_a_robot_drives_the_time_is_clingos() -> None:
     """The sketch is small enough. The robot was in 27 dstates."""
     trace = maze(3, 3, steps=120, seed=0).trace
-    mapper = OnlineMapper(trace.steps[0].view or "", limit=0.01)
+    mapper = OnlineMapper(trace.steps[0].view or "", time_limit=0.01)
     with patch.object(framing, "maps_with_frames", side_effect=AssertionError), patch.object(solver, "FRAME_AFTER", -1.0):
         for action, step in zip(trace.actions, trace.steps[1:], strict=True):
             answer = mapper.observe(action, step.view or "")
@@ -145,7 +145,7 @@ def test_what_ends_it_leaves_its_last_map_and_no_thread(stop: BaseException) -> 
     """Its own limit ends it alone; Ctrl-C the whole search."""
     walk = maze(3, 3, steps=120, seed=0)
     before = set(threading.enumerate())
-    search = Search(walk.trace, limit=60)
+    search = Search(walk.trace, time_limit=60)
     found = framing.maps_with_frames
 
     def stopped(trace: Trace, theory: Theory, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
@@ -184,7 +184,7 @@ def test_until_there_is_a_map_it_may_take_twice_as_long() -> None:
         raise KeyboardInterrupt
 
     with patch.object(framing, "maps_with_frames", timed), patch.object(Prefixes, "find_minimum", side_effect=StageTimeError):
-        solve(walk.trace, limit=1000)
+        solve(walk.trace, time_limit=1000)
     assert left[1] <= candidates.FRAMING < left[0] <= 2 * candidates.FRAMING
 
 

@@ -54,7 +54,7 @@ def test_what_grows_by_stars_is_a_map(world: str, homing: bool) -> None:
 def test_there_is_a_map_of_stars_at_any_angles_when_the_time_is_over(world: str) -> None:
     trace = drive(world, 0, 40)
     with patch.multiple(solver, OVERTIME=100.0):
-        solution = solve(trace, limit=1e-6)
+        solution = solve(trace, time_limit=1e-6)
     assert solution.status is Status.FEASIBLE
     assert check(trace, solution.maps[0], solution.theory) == ()
     assert len(solution.maps[0].dstates) < len(trace)  # known places are tried, too
@@ -96,7 +96,7 @@ def test_there_is_a_map_with_own_rules_when_the_time_is_over(name: str) -> None:
     trace = maze(3, 3, steps=60, seed=0).trace
     theory = ruled(KEPT[name], Theory.topological())
     with patch.multiple(solver, OVERTIME=100.0):
-        solution = solve(trace, theory, limit=1e-6)
+        solution = solve(trace, theory, time_limit=1e-6)
     assert solution.status is Status.FEASIBLE
     assert check(trace, solution.maps[0], Theory.topological()) == ()
 
@@ -105,7 +105,7 @@ def test_there_is_a_map_with_own_rules_when_the_time_is_over(name: str) -> None:
 def test_no_map_is_given_that_breaks_own_rules(name: str) -> None:
     trace = maze(3, 3, steps=60, seed=0).trace
     with patch.multiple(solver, OVERTIME=100.0):
-        assert solve(trace, ruled(BROKEN[name], Theory.topological()), limit=1e-6).maps == ()
+        assert solve(trace, ruled(BROKEN[name], Theory.topological()), time_limit=1e-6).maps == ()
 
 
 SMALL = Trace.from_steps("abab", ["travel", "around", "travel"])
@@ -128,7 +128,7 @@ def test_rules_are_kept_by_those_maps_that_clingo_lists(body: str, level: str) -
     theory = ruled(f"#program step(t).\n:- {body}.", plain)
 
     def maps_of(asked: Theory) -> set[SSHMap]:
-        return set(solve(SMALL, asked, maps=0).maps)
+        return set(solve(SMALL, asked, max_maps=None).maps)
 
     resolved = theory.resolve(SMALL)
     assert can_be_asked(resolved)

@@ -216,7 +216,7 @@ def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.Da
     )
     counts, expected = minimal_maps(trace, theory)
     with patch.object(prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 2, 8]))):
-        solution = solve(trace, theory, maps=0, limit=100)
+        solution = solve(trace, theory, max_maps=None, time_limit=100)
     assert solution.complete
     assert len(solution.maps) == len(expected)
     assert {key(ssh_map) for ssh_map in solution.maps} == expected
@@ -230,12 +230,12 @@ def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
     """star=alike: solver and checker against the brute force, which tries all ways to pair gateways; the maps of the bare causal theory are judged by it, too."""
     theory = Theory.causal().replace(star="alike", prefer=data.draw(st.sampled_from([("dstates",), ()])))
     _, expected = minimal_maps(trace, theory)
-    solution = solve(trace, theory, maps=0, limit=100)
+    solution = solve(trace, theory, max_maps=None, time_limit=100)
     assert solution.complete
     assert {key(ssh_map) for ssh_map in solution.maps} == expected
     assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
     _, allowed = minimal_maps(trace, theory.replace(prefer=()))
-    for ssh_map in solve(trace, Theory.causal().replace(prefer=()), maps=20, limit=100).maps:
+    for ssh_map in solve(trace, Theory.causal().replace(prefer=()), max_maps=20, time_limit=100).maps:
         assert (check(trace, ssh_map, theory) == ()) == (key(ssh_map) in allowed)
 
 
@@ -244,7 +244,7 @@ def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
 def test_checker_rejects_what_the_brute_force_does_not_find(trace: Trace, left_out: str) -> None:
     """The maps of a theory that lacks an axiom, under the axioms that have it."""
     _, allowed = minimal_maps(trace, GATEWAYS.replace(prefer=()))
-    for ssh_map in solve(trace, GATEWAYS.replace(prefer=(), without=(left_out,)), maps=20, limit=100).maps:
+    for ssh_map in solve(trace, GATEWAYS.replace(prefer=(), without=(left_out,)), max_maps=20, time_limit=100).maps:
         if key(ssh_map) not in allowed:
             assert check(trace, ssh_map, GATEWAYS)
 
@@ -302,7 +302,7 @@ def test_worlds_of_any_gateways_are_mapped_right(name: str) -> None:
     graph, steps, landmarks = WORLDS[name]
     start = next(iter(graph))
     tour = drive(graph, start, next(iter(graph[start])), steps, random.Random(0), landmarks=landmarks)
-    solution = solve(tour.trace, limit=100)
+    solution = solve(tour.trace, time_limit=100)
     assert solution.theory.star == "gateways"
     assert solution.status is Status.OPTIMAL
     assert solution.complete
@@ -320,7 +320,7 @@ def test_a_bend_ends_two_paths() -> None:
     different = [(i, j) for j in range(12) for i in range(j)]
     theory = Theory(different=different, elsewhere=[(i, j) for i, j in different if tour.truth[i][0] != tour.truth[j][0]])
     for without, counts in (((), (12, 6, 6)), (("gateway_end",), (12, 7, 4))):
-        solution = solve(trace, theory.replace(without=without), limit=100)
+        solution = solve(trace, theory.replace(without=without), time_limit=100)
         assert solution.cost is not None
         assert (solution.cost.dstates, solution.cost.places, solution.cost.paths) == counts
 
@@ -329,7 +329,7 @@ def test_a_bend_ends_two_paths() -> None:
 def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> None:
     graph = planar.scattered(6, random.Random(3))
     tour = drive(graph, 0, next(iter(graph[0])), 24, random.Random(3), noise=noise, unseen=unseen)
-    solution = solve(tour.trace, limit=100)
+    solution = solve(tour.trace, time_limit=100)
     assert solution.status is Status.OPTIMAL
     assert all(ssh_map.labels == tour.labels for ssh_map in solution.maps)
     assert solution.cost is not None
@@ -345,7 +345,7 @@ def test_no_axiom_forbids_the_true_map(spokes: int, noise: float, unseen: bool) 
     elsewhere = [(i, j) for i, j in pairs if tour.truth[i][0] != tour.truth[j][0]]
     different = [pair for pair in pairs if pair not in same]
     asserted = Theory(same=same, different=different, elsewhere=elsewhere, prefer=("dstates", "places", "paths"))
-    solution = solve(tour.trace, asserted, limit=100)
+    solution = solve(tour.trace, asserted, time_limit=100)
     assert solution.status is Status.OPTIMAL
     assert solution.maps[0].labels == tour.labels
     assert solution.cost is not None
@@ -355,7 +355,7 @@ def test_no_axiom_forbids_the_true_map(spokes: int, noise: float, unseen: bool) 
 def test_online_maps_general_stars() -> None:
     tour = drive(planar.triangle(), 0, 1, 9, random.Random(0))
     first = tour.trace.steps[0]
-    mapper = OnlineMapper(first.view or "", star=first.star, limit=None)
+    mapper = OnlineMapper(first.view or "", star=first.star, time_limit=None)
     assert mapper.theory.star == "gateways"
     for t, action in enumerate(tour.trace.actions, 1):
         step = tour.trace.steps[t]

@@ -62,9 +62,9 @@ CASES = {
 @pytest.mark.parametrize("prefer", [("dstates", "paths", "places"), ("dstates", "places", "paths"), ("dstates", "places")])
 def test_the_maps_are_those_of_the_plain_encoding(case: str, prefer: tuple[str, ...]) -> None:
     trace, theory = CASES[case], Theory.topological().replace(prefer=prefer)
-    expected = solve(trace, theory, maps=0, speedups=PLAIN)
+    expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     with patch.multiple(solver, FEW_STEPS=0, FRAME_AFTER=-1.0):
-        found = solve(trace, theory, maps=0)
+        found = solve(trace, theory, max_maps=None)
     assert (found.status, found.complete) == (Status.OPTIMAL, True)
     assert (found.cost, set(found.maps)) == (expected.cost, set(expected.maps))
 

@@ -53,11 +53,11 @@ def test_minimal_maps_are_the_best_of_all_ways_to_leave_displacements_out(trace:
     moved = [t for t, step in enumerate(trace.steps) if step.displacement is not None]
     expected: dict[float, set[tuple[tuple[int, ...], tuple[int, ...]]]] = {}
     for jumps in chain.from_iterable(combinations(moved, size) for size in range(len(moved) + 1)):
-        found = solve(trace.without_displacements_at(jumps), theory.without_faults(), maps=0)
+        found = solve(trace.without_displacements_at(jumps), theory.without_faults(), max_maps=None)
         if found.cost:
             cost = round(found.cost.dstates + price * len(jumps), 1)
             expected.setdefault(cost, set()).update((ssh_map.labels, jumps) for ssh_map in found.maps)
-    solution = solve(trace, theory, maps=0)
+    solution = solve(trace, theory, max_maps=None)
     assert solution.complete
     assert solution.cost is not None
     least = min(expected)
@@ -72,7 +72,7 @@ def test_a_robot_that_was_carried_away_finds_its_circuit_again(speedups: Speedup
     without = solve(trace).cost
     assert without is not None
     assert without.dstates == 17
-    solution = solve(trace, jumped=2, speedups=speedups, maps=0)
+    solution = solve(trace, jumped=2, speedups=speedups, max_maps=None)
     assert [(len(m.dstates), len(m.places)) for m in solution.maps] == [(8, 4)]
     (fault,) = solution.maps[0].faults
     assert fault == Fault(9, "jumped", "25.0 m ahead, 7.0 m left, turned 52 degrees left")
@@ -109,7 +109,7 @@ def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_t
         )
     trace = replace(walk.trace, steps=tuple(steps))
     true = len(set(walk.truth))
-    solution = solve(trace, jumped=3, limit=100)
+    solution = solve(trace, jumped=3, time_limit=100)
     assert solution.cost is not None
     assert solution.cost.dstates + solution.cost.faults <= true + 3 * jumps
     assert check(trace, solution.maps[0], solution.theory) == ()

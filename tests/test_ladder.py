@@ -40,8 +40,8 @@ def test_displacements_make_the_true_map_of_aces3_the_only_minimal_one() -> None
 
 def test_what_a_trace_does_not_have_is_no_rung() -> None:
     trace = aces3().trace.prefix(8)
-    assert [rung.name for rung in ladder(trace.without_displacements(), maps=1)] == ["views", "+ star", "+ planarity"]
-    causal = {rung.name: rung.solution.theory.star for rung in ladder(trace, Theory.causal(), maps=1)}
+    assert [rung.name for rung in ladder(trace.without_displacements(), max_maps=1)] == ["views", "+ star", "+ planarity"]
+    causal = {rung.name: rung.solution.theory.star for rung in ladder(trace, Theory.causal(), max_maps=1)}
     assert causal == {"views": "none", "+ star": "alike", "+ pairs": "alike", "+ geometry": "alike"}  # planarity is about places
 
 

@@ -109,7 +109,7 @@ def test_learning_reads_no_truth(run: Trace, learnt: BootstrapLearner) -> None:
 
 def test_where_maps_disagree_nothing_is_learnt_unless_one_is_chosen() -> None:
     trace = Trace.from_steps("abbab", ["travel", "around", "right", "right"])
-    solution = solve(trace, VIEWS_ALONE, maps=0)
+    solution = solve(trace, VIEWS_ALONE, max_maps=None)
     assert solution.count > 1
     with pytest.warns(AmbiguousMapWarning, match=f"{solution.count} minimal maps remain, and agree on"):
         labels = labels_of(solution.maps)
@@ -145,7 +145,7 @@ def test_other_clusterings_can_be_plugged_in(run: Trace) -> None:
 
 def test_the_learner_is_an_estimator(run: Trace, hall: Trace) -> None:
     clusterer = ViewClusterer(k_max=6, random_state=0)
-    learner = BootstrapLearner(VIEWS_ALONE, clusterer, limit=100)
+    learner = BootstrapLearner(VIEWS_ALONE, clusterer, time_limit=100)
     again = clone(learner).set_params(choose=0)
     assert again.get_params()["clusterer__k_max"] == 6
     assert (again.choose, learner.choose, again.theory) == (0, None, VIEWS_ALONE)
@@ -194,7 +194,7 @@ def test_clusterers_of_others_make_the_views(run: Trace, clusterer: Any) -> None
 def test_an_image_that_is_noise_is_not_learnt_from(run: Trace) -> None:
     odd = replace(run, steps=(*run.steps[:-1], replace(run.steps[-1], image=tuple(0.7 * r for r in run.steps[-1].image))))
     with pytest.warns(ImageWarning, match=r"1 of 96 images are like those of no view.*\(image 95\)"):
-        learner = BootstrapLearner(VIEWS_ALONE, DBSCAN(eps=1.5), limit=100).fit(odd)
+        learner = BootstrapLearner(VIEWS_ALONE, DBSCAN(eps=1.5), time_limit=100).fit(odd)
     assert (learner.views_[-1], learner.confidence_[-1], learner.labels_[-1]) == (-1, 0, -1)
     assert (learner.labels_[:-1] >= 0).all()
     assert set(learner.recogniser_.classes_) == set(learner.labels_[:-1].tolist())
@@ -551,7 +551,7 @@ def test_bad_images_are_named_where_no_fault_is_allowed() -> None:
     spoilt = replace(trace, steps=tuple(replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        learner = BootstrapLearner(limit=1)
+        learner = BootstrapLearner(time_limit=1)
         with contextlib.suppress(LearnerError):  # with openings and displacements there may be no map at all
             learner.fit(spoilt)
     assert any("(image 9" in str(w.message) for w in caught)

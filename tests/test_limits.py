@@ -98,7 +98,7 @@ def test_what_would_go_beyond_a_limit_is_not_begun(seconds: float, mebibytes: fl
 
 def test_the_search_ends_in_time_with_its_best_map(noisy: Path) -> None:
     trace = Trace.load(noisy)
-    solution = solve(trace, limit=1)
+    solution = solve(trace, time_limit=1)
     assert solution.stopped == "time limit"
     assert solution.cost is not None
     assert solution.bound.dstates == len(trace) - 1

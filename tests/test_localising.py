@@ -68,7 +68,7 @@ def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> N
     chart = charted(walk)
     for steps in (40, 100, 200):
         beginning = Chart.framed(walk.trace, Log(walk.trace, FRAMED), steps)
-        ssh_map = solve(walk.trace.prefix(steps), maps=1).maps[0]
+        ssh_map = solve(walk.trace.prefix(steps), max_maps=1).maps[0]
         at = {}
         for node, label in zip(beginning.node_of, ssh_map.labels, strict=True):
             visit, slot = beginning.facing[node]
@@ -90,13 +90,13 @@ def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> N
 def test_a_long_trace_is_solved_from_few_of_its_visits(seed: int) -> None:
     """All its minimal maps, as when clingo is told of all visits."""
     trace = maze(3, 3, steps=800, seed=seed, stars=True).trace
-    search = Search(trace, maps=0)
+    search = Search(trace, max_maps=None)
     with patch.object(same, "FIRST_PAIRS", 500):
         maps = tuple(search)
     engine = search._prefixes.engine
     assert isinstance(engine, FramedEngine)
     assert len(engine._visits._visits) < 0.8 * len(engine._visits.chart.stars)
-    expected = solve(trace, maps=0, speedups=Speedups.without("lazy"))
+    expected = solve(trace, max_maps=None, speedups=Speedups.without("lazy"))
     assert search.complete
     assert set(maps) == set(expected.maps)
     assert search.bound == expected.bound

@@ -289,7 +289,7 @@ def test_where_a_building_has_rooms_its_doors_are_the_places(tmp_path: Path) -> 
     """A robot drives around four rooms in a ring."""
     middles = {room: middle for room, middle in MIDDLES.items() if room != "closet"}
     drive = record_plan(plan_of(tmp_path, xml(DOORS[:4], middles=middles)), seed=1, metres=50)
-    done = map_log(RobotLog(tuple(scans_of(drive)), source="ring"), maps=1, limit=60, with_ladder=False)
+    done = map_log(RobotLog(tuple(scans_of(drive)), source="ring"), max_maps=1, time_limit=60, with_ladder=False)
     passed = [door for door, _ in itertools.groupby(crossing["door"] for crossing in drive.truth["crossings"])]
     assert done.imported.scale.doors
     assert len(done.imported.visits) == len(passed)

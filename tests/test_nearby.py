@@ -81,7 +81,7 @@ def test_from_any_guess_to_a_minimal_map(trace: Trace, data: st.DataObject) -> N
 @given(machines(), st.booleans(), st.integers(0, 10_000), st.data())
 def test_a_search_beside_another_changes_no_answer(trace: Trace, beside: bool, cores: int, data: st.DataObject) -> None:
     """In a thread or before; from any guess, right or wrong."""
-    expected = solve(trace, CAUSAL, maps=0, speedups=PLAIN)
+    expected = solve(trace, CAUSAL, max_maps=None, speedups=PLAIN)
     guess = data.draw(st.lists(st.integers(-1, 3), min_size=len(trace), max_size=len(trace)), label="guess")
     most = data.draw(st.sampled_from([0, 1, 3]), label="most")
     turned = Mock(side_effect=lambda _, __, size: Mock(node_of=range(size)))
@@ -93,7 +93,7 @@ def test_a_search_beside_another_changes_no_answer(trace: Trace, beside: bool, c
         patch.object(named.Chart, "turned", turned),
         patch.object(engine.Task, "has_processors", beside),
     ):
-        found = solve(trace, CAUSAL, maps=most)
+        found = solve(trace, CAUSAL, max_maps=most)
     assert found.status is Status.OPTIMAL
     assert found.bound == expected.bound
     assert set(found.maps) <= set(expected.maps)
@@ -106,7 +106,9 @@ def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> Non
     """Then names may still be fewer than dstates: what is at a rest is no map."""
     trace = moore(7, 2, steps=60, seed=seed).trace
     with patch.multiple(named, PATIENCE=1, GUESSES=1), patch.object(annealing, "STEPS", ((0.75, 100),)):
-        some, every = (solve(trace, CAUSAL, maps=most, limit=60, speedups=Speedups.without("clique,threads,prefixes")) for most in (5, 100))
+        some, every = (
+            solve(trace, CAUSAL, max_maps=most, time_limit=60, speedups=Speedups.without("clique,threads,prefixes")) for most in (5, 100)
+        )
     assert some.count == min(5, every.count)
     assert set(some.maps) <= set(every.maps) or every.count == 100
     for ssh_map in (*some.maps, *every.maps):
@@ -130,7 +132,7 @@ def either_or(parts: int) -> Trace:
 def test_all_ways_are_listed_whichever_views_need_more_names() -> None:
     """What one answer needs is not taken back for what the next one needs: that would go on for ever."""
     trace = either_or(4)
-    expected = solve(trace, CAUSAL, maps=0)
+    expected = solve(trace, CAUSAL, max_maps=None)
     searched = nearby_search(trace)
     for _ in searched.fewer(expected.maps[0].labels):
         pass
@@ -215,7 +217,7 @@ def test_where_clingo_would_prepare_for_too_long_the_search_beside_goes_on() -> 
         patch.object(engine.Task, "has_processors", True),
         patch.object(named.NamedLabels, "_check_ahead", stop),
     ):
-        solution = solve(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"), maps=1, limit=100)
+        solution = solve(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"), max_maps=1, time_limit=100)
     assert stopped
     assert solution.status is Status.OPTIMAL
     assert solution.cost == expected
@@ -237,7 +239,7 @@ def test_a_search_of_the_whole_trace_keeps_no_time_back() -> None:
         raise LimitError("time limit")
 
     with patch.object(solver.Search, "_salvage", side_effect=AssertionError), patch.object(Prefixes, "minimise", stop):
-        solution = solve(trace, limit=1000)
+        solution = solve(trace, time_limit=1000)
     assert begun == [(False, True)]
     assert solution.stopped == "time limit"
 

@@ -180,7 +180,7 @@ def test_rivals_that_differ_in_paths_alone_are_said_to() -> None:
 
 
 def test_seven_hundred_rivals_of_one_labelling_are_one_machine() -> None:
-    ssh_map = solve(maze(3, 3, steps=60, seed=0, stars=True, follow=True).trace, maps=1).maps[0]
+    ssh_map = solve(maze(3, 3, steps=60, seed=0, stars=True, follow=True).trace, max_maps=1).maps[0]
     maps = [replace(ssh_map, paths=ssh_map.paths[: 1 + i % len(ssh_map.paths)]) for i in range(780)]
     assert next_experiment(maps).alike == (tuple(range(1, 781)),)
 
@@ -286,7 +286,7 @@ def rivals() -> Iterator[tuple[Trace, Theory]]:
 def test_real_rivals_are_told_apart_by_what_is_planned() -> None:
     told = 0
     for trace, theory in rivals():
-        solution = solve(trace, theory, maps=0)
+        solution = solve(trace, theory, max_maps=None)
         experiment = next_experiment(solution, trace)
         assert experiment.complete == solution.complete
         if len(experiment.alike) == 2 and experiment.plan.branches:
@@ -308,9 +308,9 @@ def test_limits_leave_a_plan_that_says_so() -> None:
     assert experiment.plan == Plan((1, 2))
     assert experiment.warning is not None
     assert not experiment.is_settled
-    assert next_experiment(maps, limit=1e-9).stopped == "time limit"
+    assert next_experiment(maps, time_limit=1e-9).stopped == "time limit"
     with pytest.raises(SolverError, match="limit: expected a number of seconds above 0"):
-        next_experiment(maps, limit=-1)
+        next_experiment(maps, time_limit=-1)
 
 
 @pytest.mark.parametrize(
@@ -343,7 +343,7 @@ def machines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[str, s
 def test_the_shell_prints_what_python_says(machines: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["next", *machines, "--json"]) == 0
     trace = Trace.load(machines[0])
-    expected: Experiment = next_experiment(solve(trace, Theory.causal(), maps=0), trace)
+    expected: Experiment = next_experiment(solve(trace, Theory.causal(), max_maps=None), trace)
     assert json.loads(capsys.readouterr().out) == expected.to_dict()
     assert main(["next", *machines]) == 0
     out = capsys.readouterr().out

@@ -42,7 +42,7 @@ def follow(
     """The mapper at the end of a trace, and its answers after each step."""
     first, *rest = trace.steps
     mapper = OnlineMapper(
-        first.view or "", theory, star=first.star, odometry=trace.odometry, limit=limit, maps=maps, speedups=speedups or Speedups()
+        first.view or "", theory, star=first.star, odometry=trace.odometry, time_limit=limit, max_maps=maps, speedups=speedups or Speedups()
     )
     answers = [mapper.solution]
     for action, step in zip(trace.actions, rest, strict=True):
@@ -59,7 +59,7 @@ def agree(trace: Trace, theory: Theory) -> None:
     theory = theory.resolve(trace)
     _, answers = follow(trace, theory)
     for i, answer in enumerate(answers):
-        anew = solve(trace.prefix(i + 1), theory.of_steps(0, i + 1), maps=0)
+        anew = solve(trace.prefix(i + 1), theory.of_steps(0, i + 1), max_maps=None)
         assert (answer.status, answer.complete, answer.steps) == (anew.status, True, i + 1)
         assert answer.bound == anew.bound or not anew.maps
         assert set(answer.maps) == set(anew.maps)
@@ -87,7 +87,7 @@ def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
     theory = data.draw(theories(trace), label="theory").resolve(trace)
     _, answers = follow(trace, theory, maps=2, speedups=Speedups(prefixes=data.draw(st.booleans(), label="prefixes")))
     for i, answer in enumerate(answers):
-        anew = solve(trace.prefix(i + 1), theory.of_steps(0, i + 1), maps=0)
+        anew = solve(trace.prefix(i + 1), theory.of_steps(0, i + 1), max_maps=None)
         assert answer.status is anew.status
         assert answer.bound == anew.bound or answer.status is Status.UNSATISFIABLE
         assert answer.count == min(2, anew.count)
@@ -124,7 +124,7 @@ def test_a_star_seen_from_another_side_is_no_contradiction() -> None:
 
 
 def test_a_mapper_says_how_far_it_is() -> None:
-    mapper = OnlineMapper("a", limit=None)
+    mapper = OnlineMapper("a", time_limit=None)
     mapper.observe("travel", "b")
     assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
 
@@ -144,7 +144,7 @@ def test_sketches_are_consistent(data: st.DataObject) -> None:
 
 def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
     """A minimal map of so many steps goes on beyond them. After each step it is consistent, as it says; returns where it did not say so."""
-    maps = solve(trace.prefix(known), theory, maps=5).maps
+    maps = solve(trace.prefix(known), theory, max_maps=5).maps
     if not maps:
         return []
     sketch = Sketch.beyond(maps[which % len(maps)], trace.prefix(known), theory)
@@ -196,7 +196,7 @@ def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) ->
     action = trace.actions[0] if len(trace) > 1 else Action("travel", "travel")
     star = trace.steps[-1].star
     answer = mapper.observe(action, "a", star=star)
-    anew = solve(mapper.trace, theory, maps=0)
+    anew = solve(mapper.trace, theory, max_maps=None)
     assert (answer.status, answer.complete, set(answer.maps)) == (anew.status, True, set(anew.maps))
 
 
@@ -232,7 +232,7 @@ def test_maps_are_guessed_while_the_robot_drives() -> None:
     walk = maze(4, 4, steps=140, seed=1, stars=True)
     trace = walk.trace
     with patch.object(guessing, "has_processors", lambda _: True), patch.object(online, "GUESSED", 120):
-        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, limit=NO_TIME)
+        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, time_limit=NO_TIME)
         explore(trace.prefix(125), mapper)
         assert mapper._guess is not None
         assert mapper._guess.map() is not None  # waits for it
@@ -250,7 +250,7 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
         trace = maze(3, 3, steps=120, seed=seed, stars=True).trace
         theory = Theory.topological().resolve(trace)
         first = 25 + 5 * seed
-        known = solve(trace.prefix(first), theory, maps=1).maps[0]
+        known = solve(trace.prefix(first), theory, max_maps=1).maps[0]
         predicted = Log(trace, theory).replay(known.labels).labels
         for steps in (min(len(predicted), len(trace)), min(len(predicted) + 1, len(trace)), min(len(predicted) + 20, len(trace))):
             found = guessing.mended_map(trace.prefix(steps), theory, known, Speedups())
@@ -269,7 +269,7 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
 def test_nothing_is_guessed_where_that_is_switched_off(off: str) -> None:
     trace = maze(2, 2, steps=60, seed=0, stars=True).trace
     with patch.object(online, "GUESSED", 10):
-        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, limit=NO_TIME, speedups=Speedups.without(off))
+        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, time_limit=NO_TIME, speedups=Speedups.without(off))
         explore(trace, mapper)
     assert mapper._guess is None
 
@@ -304,7 +304,7 @@ assert mapper._guess and not mapper._guess.done()
 
 
 def test_what_cannot_be_leaves_no_map() -> None:
-    mapper = OnlineMapper("a", star=[1, 0, 0, 0], limit=None)
+    mapper = OnlineMapper("a", star=[1, 0, 0, 0], time_limit=None)
     assert mapper.observe("around", "b", star=[0, 0, 1, 0]).status is Status.OPTIMAL
     for view in ("a", "c", "a"):
         solution = mapper.observe("around", view, star=[1, 0, 0, 0])
@@ -370,7 +370,7 @@ def test_the_trace_settles_displacements_as_it_grows(theory: Theory, stars: bool
     trace = replace(trace, steps=tuple(replace(step, displacement=None) if t in missing else step for t, step in enumerate(trace)))
     _, answers = follow(trace, theory)
     for i in (0, 3, 4, *range(5, steps + 1, 3)):
-        answer, anew = answers[i], solve(trace.prefix(i + 1), theory, maps=0)
+        answer, anew = answers[i], solve(trace.prefix(i + 1), theory, max_maps=None)
         assert (answer.theory, answer.status, answer.complete, answer.bound) == (anew.theory, anew.status, True, anew.bound)
         assert set(answer.maps) == set(anew.maps)
         assert {name: said["pairs"] for name, said in answer.evidence.items()} == {
@@ -387,7 +387,7 @@ def test_displacements_may_be_asked_for_before_the_first_one_comes() -> None:
     theory = Theory(displacement="use", star="none")
     mapper, answers = follow(trace, theory)
     assert answers[0].theory == theory.replace(returns=1).resolve(trace.prefix(1))
-    assert set(answers[-1].maps) == set(solve(trace, theory, maps=0).maps)
+    assert set(answers[-1].maps) == set(solve(trace, theory, max_maps=None).maps)
     assert mapper.theory == theory.resolve(trace)
     assert follow(trace, Theory(displacement="none"))[0].theory.displacement == "none"
 
@@ -410,7 +410,7 @@ def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
         patch.object(online, "GUESSED", 25),
         patch.object(annealing, "ANNEALED", ((0.5, 50),)),
     ):
-        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, odometry=trace.odometry, limit=NO_TIME)
+        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, odometry=trace.odometry, time_limit=NO_TIME)
         for action, step in zip(trace.actions, trace.steps[1:], strict=True):
             answer = observed(mapper, action, step)
             assert answer.status is Status.FEASIBLE
@@ -431,7 +431,7 @@ def test_the_first_step_settles_the_stars() -> None:
         plain.observe("travel", "b", star=[1, 0, 0, 0])
     with pytest.raises(TheoryError, match="star: expected a trace with stars"):
         OnlineMapper("a", Theory(star="pattern"))
-    assert OnlineMapper("a", Theory(star="none"), limit=None).observe("travel", "b", star=[1, 0, 0, 0]).count == 1
+    assert OnlineMapper("a", Theory(star="none"), time_limit=None).observe("travel", "b", star=[1, 0, 0, 0]).count == 1
 
 
 def test_the_same_steps_give_the_same_answers() -> None:

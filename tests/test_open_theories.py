@@ -65,14 +65,14 @@ def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.Dat
             if mapper is None:
                 first = trace.steps[0]
                 assert first.view is not None
-                mapper = OnlineMapper(first.view, theory, star=first.star, odometry=trace.odometry, limit=None, maps=0)
+                mapper = OnlineMapper(first.view, theory, star=first.star, odometry=trace.odometry, time_limit=None, max_maps=None)
                 online = mapper.solution
             else:
                 step, before = trace.steps[steps - 1], trace.steps[steps - 2].action
                 assert step.view is not None
                 assert before is not None
                 online = mapper.observe(before, step.view, star=step.star, displacement=step.displacement, covariance=step.covariance)
-            for solution in (online, solve(prefix, theory, maps=0)):
+            for solution in (online, solve(prefix, theory, max_maps=None)):
                 assert solution.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
                 assert {key(ssh_map) for ssh_map in solution.maps} == expected
 
@@ -121,7 +121,7 @@ def test_an_axiom_put_into_the_encodings_and_the_theory_alone_is_obeyed(wider: t
     solution = solve(trace, causal)
     assert (solution.status, solution.cost and solution.cost.dstates) == (Status.OPTIMAL, 16)
     assert unchecked(causal) == ("forgetful",)
-    mapper = OnlineMapper("v0", causal, limit=None)
+    mapper = OnlineMapper("v0", causal, time_limit=None)
     for step, before in zip(trace.steps[1:], trace.actions, strict=True):
         assert step.view is not None
         mapper.observe(before, step.view)
@@ -218,7 +218,7 @@ def test_what_evidence_refuses_of_a_map_is_forbidden(name: str, data: st.DataObj
         patch.object(prefixes, "FIRST_PREFIX", 1),
         patch.object(search, "FEW_STEPS", 0),
     ):
-        solution = solve(trace, theory, maps=0)
+        solution = solve(trace, theory, max_maps=None)
     assert solution.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
     assert {key(ssh_map) for ssh_map in solution.maps} == expected
 
@@ -249,7 +249,7 @@ def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.
         patch.object(prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 8]), label="first prefix")),
         patch.multiple(search, FEW_STEPS=0, FRAME_AFTER=-1.0),
     ):
-        asked = Search(trace, theory, maps=0, speedups=Speedups.without("framing"))
+        asked = Search(trace, theory, max_maps=None, speedups=Speedups.without("framing"))
         found = tuple(asked)
     assert isinstance(asked._prefixes.engine, kind) or name == "frameless"
     assert asked.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
@@ -446,7 +446,7 @@ def follow(mapper: OnlineMapper, views: str) -> None:
 
 def test_a_replayed_map_that_breaks_an_axiom_is_an_internal_error_while_a_robot_drives() -> None:
     """Replays are checked, too, as long as that takes a tenth of the time at most."""
-    mapper = OnlineMapper("a", Theory.causal(), limit=None)
+    mapper = OnlineMapper("a", Theory.causal(), time_limit=None)
     right = mapper_module._Replayed.map
 
     def wrong(self: mapper_module._Replayed) -> SSHMap:

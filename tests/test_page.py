@@ -233,9 +233,9 @@ def test_view_writes_a_page_with_beliefs(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_what_assumptions_cost_is_what_an_explanation_says() -> None:
     trace = Trace.from_steps("abab", ["travel", "travel", "around"])
-    solution = solve(trace, maps=0)
+    solution = solve(trace, max_maps=None)
     known = assumptions(Listing.of(solution), trace, Theory(), seconds=1000)
-    assert known == {pair: explain_pair(trace, *pair, maps=0).assuming for pair in known}
+    assert known == {pair: explain_pair(trace, *pair, max_maps=None).assuming for pair in known}
     assert {text for told in known.values() for text in told.values()} > {"no map satisfies the axioms"}
     agreed = {(i, j) for j in range(4) for i in range(j) if len({m.labels[i] == m.labels[j] for m in solution.maps}) == 1}
     assert known.keys() == agreed
@@ -313,7 +313,7 @@ def until(happened: Callable[[], bool]) -> None:
 def test_server_solves_under_what_is_assumed_and_explains(server: PageServer) -> None:
     own = server.url.partition(str(server.port))[2]
     told = json.loads(asked(server, "POST", own + "solve", {"different": [[0, 4]]})[1])
-    assert told["text"] == solve(CORRIDOR, Theory.causal().replace(different=((0, 4),)), maps=100).headline
+    assert told["text"] == solve(CORRIDOR, Theory.causal().replace(different=((0, 4),)), max_maps=100).headline
     assert not any(entry["labels"][0] == entry["labels"][4] for entry in told["content"]["labelings"])
     why = json.loads(asked(server, "POST", own + "explain", {"pair": [0, 4]})[1])
     assert "steps 0 and 4 are one dstate in every minimal map" in why["text"]

@@ -188,7 +188,7 @@ def test_the_maps_of_the_solver_are_those_of_the_tree(route: str, planar: bool) 
     allows = [passes_no_place_twice, *([drawn] if planar else [])]
     expected = {equalities(joined, route) for joined in list(levels(route, None, allows))[-1]}
     theory = Theory(star="frame", boundary="none", next_place=True, planar=planar, prefer=())
-    found = solve(route_trace(route), theory, maps=0).maps
+    found = solve(route_trace(route), theory, max_maps=None).maps
     assert {(m.labels, tuple(m.dstates[label].place for label in m.labels)) for m in found} == expected
 
 
@@ -224,7 +224,7 @@ def test_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
     counts, expected = minimal_maps(trace, theory)
     first_prefix = data.draw(st.sampled_from([1, 8]), label="first prefix")
     with patch.object(prefixes, "FIRST_PREFIX", first_prefix), patch.object(search, "FEW_STEPS", data.draw(st.sampled_from([0, 24]))):
-        solution = solve(trace, theory, maps=0)
+        solution = solve(trace, theory, max_maps=None)
     assert solution.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
     assert {key(ssh_map) for ssh_map in solution.maps} == expected
     for ssh_map in solution.maps:
@@ -248,7 +248,7 @@ def test_what_is_refused_holds_in_no_planar_map_and_the_checker_refuses_the_same
         theory = Theory(boundary="none", path_order="partial", prefer=()).resolve(trace)
         planar = theory.replace(planar=True)
         drawable = {found for found, _ in consistent_maps(trace, planar)}
-        maps = solve(trace, theory, maps=0).maps
+        maps = solve(trace, theory, max_maps=None).maps
         reasons = {ssh_map: Planar.of(planar).refuse(trace, ssh_map) for ssh_map in maps}
         assert {key(ssh_map) for ssh_map, reason in reasons.items() if not reason} == drawable
         for ssh_map, reason in reasons.items():
@@ -267,7 +267,7 @@ def test_a_map_cut_to_first_steps_stays_planar() -> None:
         stars = [(1, 1, 1, 1)] * 10 if rng.random() < 0.5 else None
         trace = Trace.from_steps("a" * 10, [ACTIONS[letter] for letter in letters], stars=stars)
         theory = Theory(boundary="none", planar=True).resolve(trace)
-        for ssh_map in solve(trace, theory, maps=20).maps:
+        for ssh_map in solve(trace, theory, max_maps=20).maps:
             for steps in range(1, len(trace)):
                 labels = ssh_map.labels[:steps]
                 assert Planar.of(theory).refuse(trace, SSHMap(labels, ssh_map.dstates, ())) is None
@@ -280,12 +280,12 @@ def test_while_a_robot_drives_maps_are_those_of_solve(data: st.DataObject) -> No
     theory = loose(data, trace)
     first = trace.steps[0]
     assert first.view is not None
-    mapper = OnlineMapper(first.view, theory, star=first.star, limit=None, maps=0)
+    mapper = OnlineMapper(first.view, theory, star=first.star, time_limit=None, max_maps=None)
     for before, step in zip(trace.steps, trace.steps[1:], strict=False):
         assert before.action is not None
         assert step.view is not None
         online = mapper.observe(before.action, step.view, star=step.star)
-    assert {key(m) for m in online.maps} == {key(m) for m in solve(trace, theory, maps=0).maps}
+    assert {key(m) for m in online.maps} == {key(m) for m in solve(trace, theory, max_maps=None).maps}
 
 
 # Worlds
@@ -318,7 +318,7 @@ def tour() -> Trace:
 @pytest.fixture(scope="module")
 def smaller(tour: Trace) -> Solution:
     """The minimal maps of the tour without planarity, even if no travel passes a place unseen."""
-    return solve(tour, next_place=True, maps=0)
+    return solve(tour, next_place=True, max_maps=None)
 
 
 def true_labels(trace: Trace) -> tuple[int, ...]:
@@ -333,7 +333,7 @@ def test_planarity_excludes_the_minimal_maps_and_finds_the_true_one(tour: Trace,
     assert true_labels(tour) not in {ssh_map.labels for ssh_map in smaller.maps}
     for ssh_map in smaller.maps:
         assert "planar" in {violation.axiom for violation in check(tour, ssh_map, Theory(planar=True))}
-    solution = solve(tour, Theory(planar=True), maps=0)
+    solution = solve(tour, Theory(planar=True), max_maps=None)
     assert solution.status is Status.OPTIMAL
     assert [ssh_map.labels for ssh_map in solution.maps] == [true_labels(tour)]
 
@@ -375,7 +375,7 @@ def test_the_true_map_of_a_maze_is_not_refused(cells: int, steps: int, follow: b
 def test_no_travel_passes_a_place_unseen(planar: bool, expected: set[int]) -> None:
     """After two travels and a turn around, a travel leads to the second place, as a gateway leads to one gateway; else it may lead past it."""
     trace = Trace.from_steps("aabca", ["travel", "travel", "around", "travel"])
-    maps = solve(trace, Theory(planar=planar, prefer=("places",)), maps=0).maps
+    maps = solve(trace, Theory(planar=planar, prefer=("places",)), max_maps=None).maps
     assert {ssh_map.dstates[ssh_map.labels[4]].place for ssh_map in maps} == expected
 
 

@@ -201,7 +201,7 @@ def test_directions_of_doors_tell_dstates_apart(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, xml([("hub", name, p, p) for name, p in half.items()], middles={"hub": (1000, 1000), **out}))
     trace = tour(plan, 60, seed=0, odometry=Odometry(along=0.1, heading=0.05))
     for theory, right in ((Theory.causal(), False), (Theory.causal().replace(star="alike"), True)):
-        maps = solve(trace, theory, maps=0).maps
+        maps = solve(trace, theory, max_maps=None).maps
         assert all(evaluation.isomorphic for evaluation in evaluate(maps, trace).maps) == right
     general = Theory.topological().replace(star="gateways", boundary="none", displacement="none")
     assert turned(trace, true_map(plan, trace), general) is not None

@@ -30,7 +30,7 @@ from ssh_abduction.solver.steps.log import Log
 @given(machines(most_steps=30))
 def test_what_the_solver_writes_holds(trace: Trace) -> None:
     for theory in (Theory.causal(), Theory.topological().replace(star="none")) if len(trace) < 12 else (Theory.causal(),):
-        solution = solve(trace, theory, maps=1)
+        solution = solve(trace, theory, max_maps=1)
         assert solution.certificate is not None
         bound = check_bound(trace, solution.certificate.to_dict(trace))
         assert bound.faults == ()
@@ -42,7 +42,7 @@ def test_what_the_solver_writes_holds(trace: Trace) -> None:
 def test_a_certificate_is_worked_out_when_asked_for(length: int) -> None:
     """Of the prefix that clingo was given, once; whether the search, too, had need of steps that are apart, or not."""
     trace = wandering(2, rooms=5, length=length, views=3)
-    search = Search(trace, Theory.causal(), maps=1)
+    search = Search(trace, Theory.causal(), max_maps=1)
     solution = search.solution(tuple(search))
     assert solution.basis is not None
     assert "certificate" not in vars(solution.basis)
@@ -77,7 +77,7 @@ def test_a_theory_without_what_it_rests_on_has_no_certificate() -> None:
 
 
 def test_a_mapper_gives_a_certificate() -> None:
-    mapper = OnlineMapper("a", Theory.causal(), limit=None)
+    mapper = OnlineMapper("a", Theory.causal(), time_limit=None)
     for view in "bab":
         mapper.observe("travel", view)
     assert mapper.solution.certificate is not None
@@ -99,7 +99,7 @@ def test_a_short_trace_is_solved_without_numpy() -> None:
 
 def certified() -> tuple[Trace, dict[str, Any]]:
     trace = wandering(1, rooms=12, length=300, views=3)
-    certificate = solve(trace, Theory.causal(), maps=1).certificate
+    certificate = solve(trace, Theory.causal(), max_maps=1).certificate
     assert certificate is not None
     return trace, certificate.to_dict(trace)
 

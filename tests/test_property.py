@@ -24,7 +24,7 @@ def agree(trace: Trace, theory: Theory) -> None:
     """The solver lists each minimal map once, with its costs, and the checker accepts it."""
     toys = [toy for toy in TOYS if toy.rules in theory.rules]
     counts, expected = minimal_maps(trace, theory, lambda key: all(toy.allows(key) for toy in toys))
-    solution = solve(trace, theory, maps=0, limit=LIMIT)
+    solution = solve(trace, theory, max_maps=None, time_limit=LIMIT)
     assert solution.complete
     listed = [key(ssh_map) for ssh_map in solution.maps]
     assert len(listed) == len(set(listed))
@@ -75,6 +75,6 @@ def test_checker_rejects_what_the_brute_force_does_not_find(data: st.DataObject)
     theory = data.draw(theories(trace, fixed=FOREIGN), label="theory of the maps")
     other = data.draw(theories(trace, fixed=FOREIGN), label="theory to check them by")
     consistent = {found for found, _ in consistent_maps(trace, other)}
-    for ssh_map in solve(trace, theory, maps=50, limit=LIMIT).maps:
+    for ssh_map in solve(trace, theory, max_maps=50, time_limit=LIMIT).maps:
         if key(ssh_map) not in consistent:
             assert check(trace, ssh_map, other)

@@ -39,8 +39,8 @@ def followed(
         star=first.star,
         confidence=first.confidence,
         odometry=trace.odometry,
-        limit=limit,
-        maps=maps,
+        time_limit=limit,
+        max_maps=maps,
         speedups=speedups or Speedups(),
     )
     yield mapper, mapper.solution
@@ -87,7 +87,7 @@ def test_what_is_known_of_steps_and_places_is_obeyed(data: st.DataObject) -> Non
         pairs = [pair for pair in [(0, 2), (1, 3)] if max(pair) < len(trace)]
         theory = Theory.causal().replace(**prices, **{data.draw(st.sampled_from(["same", "different"])): pairs})
     for _, solution in followed(trace, theory):
-        anew = solve(trace.prefix(solution.steps), theory.of_steps(0, solution.steps), maps=0)
+        anew = solve(trace.prefix(solution.steps), theory.of_steps(0, solution.steps), max_maps=None)
         assert (solution.status, solution.complete) == (anew.status, True)
         assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
         assert len(solution.maps) == len(anew.maps)
@@ -96,7 +96,7 @@ def test_what_is_known_of_steps_and_places_is_obeyed(data: st.DataObject) -> Non
 def test_a_theory_without_an_axiom_is_solved_anew() -> None:
     theory = Theory.causal().replace(misread=0.4, without=("deterministic",))
     for _, solution in followed(Trace.from_steps("abaabb", ["travel"] * 5), theory):
-        anew = solve(Trace.from_steps("abaabb", ["travel"] * 5).prefix(solution.steps), theory, maps=0)
+        anew = solve(Trace.from_steps("abaabb", ["travel"] * 5).prefix(solution.steps), theory, max_maps=None)
         assert (solution.status, solution.complete) == (anew.status, True)
         assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
 
@@ -156,7 +156,7 @@ def test_without_time_there_is_a_map_and_a_belief() -> None:
 
 def one_of_the_maps(trace: Trace, theory: Theory, limit: float | None, maps: int, speedups: Speedups) -> recovery.Solved:
     """As if there were time to prove one map minimal, but not to list all."""
-    found = solve(trace, theory, maps=0)
+    found = solve(trace, theory, max_maps=None)
     return recovery.Solved(len(trace), found.status, found.maps[-1:], found.bound, complete=False, stopped="time limit")
 
 
@@ -189,7 +189,7 @@ def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(in_a_st
     assert solution.complete
     assert mapper is not None
     assert mapper.standing.certain
-    assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in solve(trace, BOTH, maps=0).maps}
+    assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in solve(trace, BOTH, max_maps=None).maps}
 
 
 class Busy:
@@ -213,7 +213,7 @@ def test_a_process_of_its_own_solves_the_trace() -> None:
     assert meanwhile.done()
     assert found is not None
     assert (found.status, found.complete, found.steps) == (Status.OPTIMAL, True, 21)
-    assert found.maps == solve(trace, BOTH, maps=0).maps
+    assert found.maps == solve(trace, BOTH, max_maps=None).maps
     ended = Meanwhile(circuit(2000, wrong=17), BOTH, 0, Speedups())
     del ended  # and with it the process
     assert not _under_way
@@ -221,12 +221,12 @@ def test_a_process_of_its_own_solves_the_trace() -> None:
 
 def test_displacements_that_come_later_are_used() -> None:
     """Maps are sought anew where the trace settles the theory anew."""
-    mapper = OnlineMapper("corner", Theory.causal().replace(misread=1.5), odometry={"along": 0.02}, limit=None)
+    mapper = OnlineMapper("corner", Theory.causal().replace(misread=1.5), odometry={"along": 0.02}, time_limit=None)
     mapper.observe("travel", "wall")
     for _ in range(4):
         mapper.observe("left", "corner", displacement=(0.0, 0.0, 1.5708))
         solution = mapper.observe("travel", "wall", displacement=(10.0, 0.0, 0.0))
-    anew = solve(mapper.trace, mapper.theory, maps=0)
+    anew = solve(mapper.trace, mapper.theory, max_maps=None)
     assert mapper.theory.displacement == "use"
     assert solution.status is Status.OPTIMAL
     assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
@@ -260,7 +260,7 @@ def test_rivals_are_weighed_by_faults_and_by_what_they_assume() -> None:
 
 
 def test_what_does_not_fit_is_refused_and_changes_nothing() -> None:
-    mapper = OnlineMapper("v0", BOTH, limit=None)
+    mapper = OnlineMapper("v0", BOTH, time_limit=None)
     before = mapper.observe("right", "v1")
     with pytest.raises(TraceError, match="action"):
         mapper.observe({"name": "right", "kind": "travel"}, "v2")

@@ -77,7 +77,7 @@ def clock() -> Iterator[Callable[[float], None]]:
 def test_prefixes_give_what_solving_at_once_gives(tour: str, theory: Theory) -> None:
     world, place, heading, actions = TOURS[tour]
     trace = drive(world, place, heading, actions, stars=theory.level == "topological")
-    by_prefix, at_once = solve(trace, theory, maps=0), solve(trace, theory, maps=0, speedups=Speedups(prefixes=False))
+    by_prefix, at_once = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=None, speedups=Speedups(prefixes=False))
     assert set(by_prefix.maps) == set(at_once.maps)
     assert (by_prefix.cost, by_prefix.bound, by_prefix.complete) == (at_once.cost, at_once.bound, True)
     assert at_once.prefix == len(trace)
@@ -86,7 +86,7 @@ def test_prefixes_give_what_solving_at_once_gives(tour: str, theory: Theory) -> 
 @pytest.mark.parametrize("seed", range(6))
 def test_prefixes_of_random_machines(seed: int) -> None:
     trace = wandering(seed, rooms=4, length=40, views=3)
-    by_prefix, at_once = (solve(trace, Theory.causal(), maps=0, speedups=Speedups(prefixes=p)) for p in (True, False))
+    by_prefix, at_once = (solve(trace, Theory.causal(), max_maps=None, speedups=Speedups(prefixes=p)) for p in (True, False))
     assert set(by_prefix.maps) == set(at_once.maps)
     assert len(set(by_prefix.maps)) == by_prefix.count
 
@@ -100,8 +100,8 @@ def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
         patch.setattr(prefixes, "FIRST_PREFIX", 1)
         patch.setattr(stepwise, "GROWTH", 1.0)
         patch.setattr(prefixes, "FIRST_PATHS", 1)
-        by_prefix = solve(trace, theory, maps=0)
-    at_once = solve(trace, theory, maps=0, speedups=Speedups(prefixes=False))
+        by_prefix = solve(trace, theory, max_maps=None)
+    at_once = solve(trace, theory, max_maps=None, speedups=Speedups(prefixes=False))
     assert set(by_prefix.maps) == set(at_once.maps)
     assert by_prefix.count == len(set(by_prefix.maps)) == at_once.count
     assert by_prefix.status == at_once.status
@@ -111,10 +111,10 @@ def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
 def test_streaming_lists_no_map_twice_and_misses_none(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """With nothing held back, maps stream from a prefix that is too short for others."""
     trace = wandering(seed, rooms=5, length=30, views=3)
-    at_once = solve(trace, Theory.causal(), maps=0, speedups=Speedups(prefixes=False))
+    at_once = solve(trace, Theory.causal(), max_maps=None, speedups=Speedups(prefixes=False))
     monkeypatch.setattr(prefixes, "FIRST_PREFIX", 2)
     monkeypatch.setattr(prefixes, "HELD_BACK", 1)
-    streamed = solve(trace, Theory.causal(), maps=0)
+    streamed = solve(trace, Theory.causal(), max_maps=None)
     assert streamed.count == len(set(streamed.maps))
     assert set(streamed.maps) == set(at_once.maps)
 
@@ -142,12 +142,12 @@ def test_arguments_of_another_kind(arguments: tuple[Any, ...], message: str) -> 
     ("call", "message"),
     [
         (lambda: OnlineMapper("a", "causal"), "theory: expected a Theory, got 'causal'"),
-        (lambda: OnlineMapper("a", limit="5"), "limit: expected a number of seconds above 0, got '5'"),
+        (lambda: OnlineMapper("a", time_limit="5"), "limit: expected a number of seconds above 0, got '5'"),
         (lambda: OnlineMapper("a", speedups=None), "speedups: expected Speedups, got None"),
         (lambda: BootstrapLearner().fit(None), "traces: expected a Trace, or a list of them, got None"),
         (lambda: check(TRACE, None), "map: expected an SSHMap, got None"),
-        (lambda: solve(TRACE, memory=float("nan")), "memory (--memory-limit): expected a number of MiB above 0, got nan"),
-        (lambda: solve(TRACE, limit=10**400), "limit (--time-limit): expected a number of seconds above 0, got 1000"),
+        (lambda: solve(TRACE, memory_limit=float("nan")), "memory (--memory-limit): expected a number of MiB above 0, got nan"),
+        (lambda: solve(TRACE, time_limit=10**400), "limit (--time-limit): expected a number of seconds above 0, got 1000"),
         (lambda: solve(TRACE, speedups="none"), "speedups: expected Speedups, got 'none'"),
         (lambda: solve(TRACE, on_progress=3), "on_progress: expected a function of one Progress, got 3"),
         (lambda: Speedups.without(3), "speedups: expected names out of "),
@@ -163,7 +163,7 @@ def test_arguments_of_another_kind_are_errors_of_the_package(call: Callable[[], 
 @pytest.mark.parametrize("maps", [None, 1.5, True])
 def test_a_number_of_maps_is_whole(maps: Any) -> None:
     with pytest.raises(SolverError, match="maps"):
-        solve(rectangle(8), maps=maps)
+        solve(rectangle(8), max_maps=maps)
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
@@ -189,7 +189,7 @@ def test_a_surprise_after_many_circuits_is_not_missed() -> None:
     """50 circuits and then another view: the closed map is wrong, and the surprise is in the answer."""
     circuits = rectangle(48)
     surprised = Trace.from_steps([*circuits.views[:-1], "surprise"], circuits.actions)  # type: ignore[list-item]
-    solution = solve(surprised, Theory.causal(), maps=0)
+    solution = solve(surprised, Theory.causal(), max_maps=None)
     assert solution.prefix == len(surprised)
     assert solution.status is Status.OPTIMAL
     for ssh_map in solution.maps:
@@ -201,18 +201,18 @@ def test_a_surprise_after_many_circuits_is_not_missed() -> None:
 def test_at_most_so_many_maps() -> None:
     trace = drive(*TOURS["comb"])
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
-    some, everything = solve(trace, theory, maps=5), solve(trace, theory, maps=0)
+    some, everything = solve(trace, theory, max_maps=5), solve(trace, theory, max_maps=None)
     assert (some.count, some.complete, some.stopped, some.status) == (5, False, "maps limit", Status.OPTIMAL)
     assert (everything.count, everything.complete, everything.stopped) == (308, True, None)
     assert set(some.maps) <= set(everything.maps)
-    exactly = solve(trace, theory, maps=308)
+    exactly = solve(trace, theory, max_maps=308)
     assert (exactly.count, exactly.complete, exactly.stopped) == (308, True, None)
 
 
 def test_a_stream_of_millions_starts_at_once() -> None:
     """One and a half circuits have 20,289 consistent maps without sides; three have far more than anyone waits for."""
     theory = Theory(boundary="none", path_order="partial", prefer=())
-    search = Search(rectangle(24), theory, maps=0)
+    search = Search(rectangle(24), theory, max_maps=None)
     first = list(itertools.islice(search, 400))
     assert len(set(first)) == 400
     assert search.count == 400
@@ -226,7 +226,7 @@ def test_nothing_preferred_means_all_consistent_maps() -> None:
 
 def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
     trace = too_hard()
-    solution = solve(trace, Theory.causal(), limit=1)
+    solution = solve(trace, Theory.causal(), time_limit=1)
     assert solution.stopped == "time limit"
     assert solution.status is Status.FEASIBLE
     assert solution.count == 1
@@ -238,14 +238,14 @@ def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
 
 
 def test_no_time_at_all_is_unknown_not_unsatisfiable() -> None:
-    solution = solve(drive(*TOURS["comb"]), limit=1e-9, speedups=Speedups.without("greedy"))
+    solution = solve(drive(*TOURS["comb"]), time_limit=1e-9, speedups=Speedups.without("greedy"))
     assert (solution.status, solution.stopped, solution.maps, solution.cost) == (Status.UNKNOWN, "time limit", (), None)
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
 def test_no_time_at_all_still_leaves_a_map_and_a_bound(theory: Theory) -> None:
     trace = drive(*TOURS["comb"])
-    solution, best = solve(trace, theory, limit=1e-9), solve(trace, theory, maps=1)
+    solution, best = solve(trace, theory, time_limit=1e-9), solve(trace, theory, max_maps=1)
     assert (solution.status, solution.stopped, solution.count) == (Status.FEASIBLE, "time limit", 1)
     assert check(trace, solution.maps[0], theory) == ()
     assert solution.certificate is not None
@@ -255,7 +255,7 @@ def test_no_time_at_all_still_leaves_a_map_and_a_bound(theory: Theory) -> None:
 
 def test_time_limit_while_listing_keeps_the_proof() -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=())
-    search = Search(rectangle(20), theory, limit=1000, maps=0)
+    search = Search(rectangle(20), theory, time_limit=1000, max_maps=None)
     maps = []
     for ssh_map in search:
         maps.append(ssh_map)
@@ -266,7 +266,7 @@ def test_time_limit_while_listing_keeps_the_proof() -> None:
 
 
 def test_memory_limit_stops_with_a_status() -> None:
-    solution = solve(drive(*TOURS["comb"]), memory=1, speedups=Speedups.without("greedy"))
+    solution = solve(drive(*TOURS["comb"]), memory_limit=1, speedups=Speedups.without("greedy"))
     assert (solution.status, solution.stopped) == (Status.UNKNOWN, "memory limit")
 
 
@@ -444,13 +444,13 @@ def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
     engine.grow(len(trace))
     minimal = list(engine.improving_maps())[-1]
     assert {found.map for found in engine.maps_of_cost(minimal.cost, 0)} == set(
-        solve(trace, theory, maps=0, speedups=Speedups(prefixes=False)).maps
+        solve(trace, theory, max_maps=None, speedups=Speedups(prefixes=False)).maps
     )
 
 
 def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPatch) -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
-    search = Search(drive(*TOURS["comb"]), theory, maps=0)
+    search = Search(drive(*TOURS["comb"]), theory, max_maps=None)
     honest = search._prefixes.engine.maps_of_cost
 
     def interrupted(cost: tuple[int, ...], enough: int) -> Iterator[object]:
@@ -471,8 +471,8 @@ def test_a_stop_while_the_prefix_grows_gives_the_maps_that_replayed(monkeypatch:
     given = []
     for seed in (1, 4, 6):
         trace = wandering(seed, rooms=4, length=14, views=2)
-        every = set(solve(trace, Theory.causal(), maps=0).maps)
-        search = Search(trace, Theory.causal(), maps=0)
+        every = set(solve(trace, Theory.causal(), max_maps=None).maps)
+        search = Search(trace, Theory.causal(), max_maps=None)
         grow = search._prefixes.engine.grow
 
         def stopped(size: int, search: Search = search, grow: Callable[[int], None] = grow) -> None:
@@ -497,14 +497,14 @@ def test_a_search_runs_once() -> None:
 
 def test_costs_are_right_where_a_map_cannot_show_them() -> None:
     """Without one_place a dstate may be at many places; the map shows the first, the cost counts all."""
-    solution = solve(Trace.from_steps("aaaaa", ["travel"] * 4), Theory(prefer=("places",), without=("one_place",)), maps=0)
+    solution = solve(Trace.from_steps("aaaaa", ["travel"] * 4), Theory(prefer=("places",), without=("one_place",)), max_maps=None)
     assert solution.cost is not None
     assert (solution.cost.places, solution.bound.places, solution.count) == (5, 5, 11)
 
 
 def test_the_time_of_the_caller_does_not_count() -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
-    search = Search(drive(*TOURS["comb"]), theory, maps=5, limit=1000)
+    search = Search(drive(*TOURS["comb"]), theory, max_maps=5, time_limit=1000)
     with clock() as later:
         for _ in search:
             later(500)
@@ -512,7 +512,7 @@ def test_the_time_of_the_caller_does_not_count() -> None:
 
 
 def test_the_clock_runs_on_for_an_explanation() -> None:
-    search = Search(Trace.from_steps("abcd", ["travel", "around", "around"]), limit=1000)
+    search = Search(Trace.from_steps("abcd", ["travel", "around", "around"]), time_limit=1000)
     with clock() as later:
         assert list(search) == []
         assert search.status is Status.UNSATISFIABLE
@@ -549,19 +549,19 @@ def shape(ssh_map: SSHMap) -> tuple[object, ...]:
 @given(traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory))))
 def test_renaming_and_mirroring_leave_the_maps_alone(case: tuple[Trace, Theory]) -> None:
     trace, theory = case
-    shapes = {shape(m) for m in solve(trace, theory, maps=0).maps}
+    shapes = {shape(m) for m in solve(trace, theory, max_maps=None).maps}
     stars = [step.star for step in trace.steps] if trace.has_stars else None
     views = [f"seen {v}" for v in trace.views]
     moved = [step.displacement for step in trace.steps[1:]] if trace.has_displacements else None
     renamed = [{"name": f"do {a.name}", "kind": a.kind, "turn": a.turn} for a in trace.actions]
     again = Trace.from_steps(views, renamed, stars=stars, displacements=moved, odometry=trace.odometry)
-    assert {shape(m) for m in solve(again, theory, maps=0).maps} == shapes
+    assert {shape(m) for m in solve(again, theory, max_maps=None).maps} == shapes
     flip = {"right": "left", "left": "right", "around": "around", None: None}
     mirrored = [{"name": a.name, "kind": a.kind, "turn": flip[a.turn]} for a in trace.actions]
     turned = [None if s is None else (s[0], s[3], s[2], s[1]) for s in stars] if stars else None
     mirrored_moves = [None if d is None else (d[0], -d[1], -d[2]) for d in moved] if moved else None
     mirror = Trace.from_steps(views, mirrored, stars=turned, displacements=mirrored_moves, odometry=trace.odometry)
-    assert {shape(m) for m in solve(mirror, theory, maps=0).maps} == shapes
+    assert {shape(m) for m in solve(mirror, theory, max_maps=None).maps} == shapes
 
 
 def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
@@ -590,7 +590,7 @@ def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
 def test_whether_there_is_one_more_map_is_not_sought_for_long() -> None:
     """Where the last of those asked for is known, and what comes after it takes its time."""
     trace = maze(2, 2, steps=200, seed=0).trace
-    every = solve(trace, Theory.causal(), maps=0)
+    every = solve(trace, Theory.causal(), max_maps=None)
     assert (every.complete, every.stopped) == (True, None)
     listed = CausalEngine.maps_of_cost
 
@@ -600,7 +600,7 @@ def test_whether_there_is_one_more_map_is_not_sought_for_long() -> None:
             self.asker.watch.check()
 
     with patch.object(CausalEngine, "maps_of_cost", slow), patch.object(solver_module, "ONE_MORE", 0.01):
-        search = Search(trace, Theory.causal(), maps=every.count, limit=100.0)
+        search = Search(trace, Theory.causal(), max_maps=every.count, time_limit=100.0)
         asked_for = search.solution(tuple(search))
     assert set(asked_for.maps) == set(every.maps)
     assert (asked_for.status, asked_for.complete, asked_for.stopped) == (Status.OPTIMAL, False, "maps limit")

@@ -62,7 +62,7 @@ def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
 @given(machines(), st.sets(st.sampled_from(NAMES)), st.data())
 def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trace, off: set[str], data: st.DataObject) -> None:
     """With prefixes, patience and what is held back so small that all of it happens on short traces."""
-    expected = solve(trace, Theory.causal(), maps=0, speedups=PLAIN)
+    expected = solve(trace, Theory.causal(), max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, 5, 32]), label="first prefixes")
     at_once = data.draw(st.sampled_from([4, 8000]), label="at once")
     whole = data.draw(st.sampled_from([4, 8000]), label="whole")
@@ -73,7 +73,7 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trac
     settings = patch.multiple(engine, FIRST_PREFIXES=first, AT_ONCE=at_once)
     fewer = patch.multiple(named, AT_ONCE=at_once, WHOLE=whole, PATIENCE=patience, HELD_BACK=held, CORES=cores, SPARES=spares, MORE_LINKS=2)
     with settings, fewer, patch.object(solver, "FEW_STEPS", 0):
-        found = solve(trace, Theory.causal(), maps=0, speedups=Speedups.without(off))
+        found = solve(trace, Theory.causal(), max_maps=None, speedups=Speedups.without(off))
     assert found.status is expected.status is Status.OPTIMAL
     assert found.cost == expected.cost
     assert set(found.maps) == set(expected.maps)
@@ -95,7 +95,7 @@ def test_names_read_from_where_actions_lead_are_those_read_whole(seed: int) -> N
     few = patch.multiple(named, PATIENCE=0, CORES=0, SPARES=0)
     with few, patch.object(facts.NameReader, "read", compared):
         speedups = Speedups.without(("annealed", "threads"))
-        assert solve(moore(8, 2, steps=60, seed=seed).trace, Theory.causal(), maps=20, speedups=speedups).complete
+        assert solve(moore(8, 2, steps=60, seed=seed).trace, Theory.causal(), max_maps=20, speedups=speedups).complete
     assert answers
 
 
@@ -140,7 +140,7 @@ def reads_of(case: str) -> list[str]:
     """The speed-ups that a search of this case asks for."""
     trace, theory = CASES[case]
     with noted_reads() as read, hurried():
-        solve(trace, theory, maps=0)
+        solve(trace, theory, max_maps=None)
     return [name for name in NAMES if name in read]
 
 
@@ -153,9 +153,9 @@ def test_each_speedup_is_asked_for_in_some_case() -> None:
 def test_each_speedup_that_is_read_off_alone(case: str) -> None:
     trace, theory = CASES[case]
     with hurried():
-        expected = solve(trace, theory, maps=0)
+        expected = solve(trace, theory, max_maps=None)
         for off in reads_of(case):
-            found = solve(trace, theory, maps=0, speedups=Speedups.without(off))
+            found = solve(trace, theory, max_maps=None, speedups=Speedups.without(off))
             assert set(found.maps) == set(expected.maps), off
             assert found.cost == expected.cost, off
 
@@ -164,9 +164,9 @@ def test_each_speedup_that_is_read_off_alone(case: str) -> None:
 def test_as_many_maps_as_asked_for(most: int) -> None:
     """Spurs off a ring that look alike: with what is lazy, and what is held back, the number asked for comes, and no map twice."""
     trace = Trace.from_steps("abacabadabacab", ["travel", "right", "travel", "left", "right", "right", "travel"] + ["travel", "left"] * 3)
-    every = solve(trace, Theory.causal(), maps=0, speedups=PLAIN)
+    every = solve(trace, Theory.causal(), max_maps=None, speedups=PLAIN)
     with patch.object(solver, "FEW_STEPS", 0):
-        found = solve(trace, Theory.causal(), maps=most)
+        found = solve(trace, Theory.causal(), max_maps=most)
     assert found.count == min(most, every.count)
     assert set(found.maps) <= set(every.maps)
     assert found.complete == (every.count <= most)
@@ -293,7 +293,7 @@ def test_maps_found_before_a_limit_strikes_are_given(off: str) -> None:
 
     walk = maze(3, 3, steps=200, seed=0)
     with patch.object(named.NamedLabels, "_answers_of", stopped):
-        solution = solve(walk.trace, Theory.causal(), maps=100, speedups=Speedups.without(off))
+        solution = solve(walk.trace, Theory.causal(), max_maps=100, speedups=Speedups.without(off))
     assert (solution.status, solution.stopped) == (Status.OPTIMAL, "time limit")
     assert solution.count == len(set(solution.maps)) >= 3
     for ssh_map in solution.maps:
@@ -314,7 +314,7 @@ def test_what_cannot_be_stopped_is_not_begun_where_time_is_short() -> None:
     """clingo is not told where names lead, if the limit would be over before it can be stopped. The clique is a bound by then."""
     walk = moore(8, 2, steps=100, seed=0)
     with patch.object(named, "SECONDS_A_CHARACTER", 1.0), patch.object(named, "new_control", side_effect=AssertionError):
-        solution = solve(walk.trace, Theory.causal(), limit=30, speedups=Speedups.without("prefixes"))
+        solution = solve(walk.trace, Theory.causal(), time_limit=30, speedups=Speedups.without("prefixes"))
     assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
     assert solution.certificate
     assert solution.bound.dstates == len(solution.certificate.clique) > 2

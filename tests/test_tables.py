@@ -31,7 +31,7 @@ Expected = int | tuple[int, ...]
 
 def answer(trace: Trace, theory: Theory, expected: Expected) -> tuple[Expected, int | None]:
     """The counts of the minimal maps in the table's form, and how many maps there are; each map is checked."""
-    solution = solve(trace, theory, maps=0)
+    solution = solve(trace, theory, max_maps=None)
     assert solution.status is Status.OPTIMAL
     assert solution.complete
     assert solution.cost is not None
@@ -149,7 +149,7 @@ def test_notched_rectangle_by_number_of_actions(theory: Theory, actions: int, ex
 @pytest.mark.parametrize("theory", [P0, P1, P2, P3])
 @pytest.mark.parametrize("actions", LENGTHS)
 def test_the_mirror_image_has_mirrored_maps(theory: Theory, actions: int) -> None:
-    clockwise, anticlockwise = (solve(rectangle(actions, turn=turn), theory, maps=0) for turn in "RL")
+    clockwise, anticlockwise = (solve(rectangle(actions, turn=turn), theory, max_maps=None) for turn in "RL")
     assert {m.labels for m in clockwise.maps} == {m.labels for m in anticlockwise.maps}
     assert {m.dstates for m in clockwise.maps} == {m.dstates for m in anticlockwise.maps}
 
@@ -162,7 +162,7 @@ def test_the_mirror_image_has_mirrored_maps(theory: Theory, actions: int) -> Non
     ],
 )
 def test_numbers_of_all_consistent_maps(theory: Theory, counts: list[int]) -> None:
-    assert [solve(rectangle(n), theory, maps=0).count for n in range(len(counts))] == counts
+    assert [solve(rectangle(n), theory, max_maps=None).count for n in range(len(counts))] == counts
 
 
 STARRED = {"pattern": P2.replace(star="pattern"), "frame": FRAME}
@@ -231,12 +231,12 @@ def test_aces3_route(theory: Theory, expected: Expected, count: int) -> None:
 @pytest.mark.parametrize(("first", "second", "actions"), [(0, 4, 4), (1, 5, 5), (2, 6, 6), (3, 7, 7)])
 def test_half_a_circuit_tells_aliased_dstates_apart(first: int, second: int, actions: int) -> None:
     """Section 6.2: with 4 to 7 actions no two steps of one view are equal in any consistent map."""
-    for ssh_map in solve(rectangle(actions), P2.replace(prefer=()), maps=0).maps:
+    for ssh_map in solve(rectangle(actions), P2.replace(prefer=()), max_maps=None).maps:
         assert ssh_map.labels[first] != ssh_map.labels[second]
 
 
 @pytest.mark.parametrize(("actions", "equal"), [(8, {(0, 8)}), (9, {(0, 8), (1, 9)}), (10, {(0, 8), (1, 9), (2, 10)})])
 def test_which_equalities_are_possible(actions: int, equal: set[tuple[int, int]]) -> None:
     """Section 6.2: what holds in at least one consistent map."""
-    maps = solve(rectangle(actions), P2.replace(prefer=()), maps=0).maps
+    maps = solve(rectangle(actions), P2.replace(prefer=()), max_maps=None).maps
     assert {(i, j) for m in maps for j in range(actions + 1) for i in range(j) if m.labels[i] == m.labels[j]} == equal

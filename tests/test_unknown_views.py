@@ -47,8 +47,8 @@ def test_to_hide_a_view_never_costs_anything(data: st.DataObject) -> None:
     choices = data.draw(st.sampled_from([{}, {"misread": 1.5}, {"slipped": 1.0}, {"misread": 0.5, "slipped": 2.0}]), label="faults")
     theory = data.draw(st.sampled_from([Theory.causal(), Theory.topological()]), label="theory").replace(**choices)
     steps = data.draw(st.sets(st.integers(0, len(trace) - 1), min_size=1), label="hidden")
-    before, unknown = solve(trace, theory, limit=LIMIT), hidden(trace, steps)
-    after = solve(unknown, theory, limit=LIMIT)
+    before, unknown = solve(trace, theory, time_limit=LIMIT), hidden(trace, steps)
+    after = solve(unknown, theory, time_limit=LIMIT)
     for ssh_map in after.maps:
         assert check(unknown, ssh_map, theory) == ()
         assert not any(fault.kind == "misread" and unknown.views[fault.step] is None for fault in ssh_map.faults)
@@ -61,14 +61,14 @@ def test_to_hide_a_view_never_costs_anything(data: st.DataObject) -> None:
 def test_an_unknown_step_does_not_make_two_views_one() -> None:
     """The step between could be at either dstate, but not at both."""
     trace = Trace.from_steps(["a", None, "b"], ["stay", "stay"])
-    found = solve(trace, Theory.causal(), maps=0)
+    found = solve(trace, Theory.causal(), max_maps=None)
     assert {m.labels for m in found.maps} == {(0, 0, 1), (0, 1, 1)} - {(0, 0, 1)}  # after the first, the same action would lead to b
     assert [s.view for s in found.maps[0].dstates] == ["a", "b"]
 
 
 def test_a_dstate_that_was_never_seen_has_no_view(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trace = Trace.from_steps([None if t == 2 else view for t, view in enumerate(CORRIDOR)], DRIVEN)
-    (ssh_map,) = solve(trace, Theory.topological(), maps=0).maps
+    (ssh_map,) = solve(trace, Theory.topological(), max_maps=None).maps
     assert [s.view for s in ssh_map.dstates] == ["end", "hall", None, "end", "hall", "end"]
     ssh_map.save(tmp_path / "map.json")
     assert SSHMap.load(tmp_path / "map.json") == ssh_map
@@ -108,7 +108,7 @@ def test_a_null_is_unknown_and_a_missing_field_is_an_error(tmp_path: Path) -> No
 def test_there_is_a_map_when_the_time_is_over(theory: Theory) -> None:
     trace = drive(*TOURS["comb"])
     trace = hidden(trace, set(range(1, len(trace), 3)))
-    found = solve(trace, theory, limit=1e-9)
+    found = solve(trace, theory, time_limit=1e-9)
     assert found.maps
     assert check(trace, found.maps[0], theory) == ()
 
@@ -128,7 +128,7 @@ def test_while_a_robot_drives_each_view_is_known() -> None:
 
 def test_rivals_are_not_told_apart_by_what_was_never_seen() -> None:
     trace = Trace.from_steps(["a", None, "a", "b", "a"], ["x", "y", "x", "y"])
-    solution = solve(trace, Theory.causal().replace(prefer=()), maps=0)
+    solution = solve(trace, Theory.causal().replace(prefer=()), max_maps=None)
     assert solution.count > 1
     assert json.loads(json.dumps(compare(solution).to_dict()))
     plan = next_experiment(solution, trace).to_dict()["plan"]

@@ -36,7 +36,7 @@ def misread() -> tuple[Trace, Solution]:
 
 
 def online() -> tuple[Trace, Solution]:
-    mapper = OnlineMapper("v0", Theory.causal(), limit=None)
+    mapper = OnlineMapper("v0", Theory.causal(), time_limit=None)
     for t in range(1, 10):
         mapper.observe(("right", "travel")[(t - 1) % 2], f"v{t % 4}")
     solution = mapper.observe("travel", "v2")
@@ -56,16 +56,16 @@ def noisy() -> Trace:
 SOLVED: dict[str, Callable[[], tuple[Trace, Solution]]] = {
     "several maps": lambda: (ACES, SOLUTION),
     "one map": lambda: (RECTANGLE, solve(RECTANGLE)),
-    "cut off": lambda: (ACES, solve(ACES, maps=2)),
-    "levels": lambda: (ACES, solve(ACES, within=3, maps=0, prefer=("dstates", "places", "paths"))),
-    "levels cut off": lambda: (ACES, solve(ACES, within=3, maps=9, prefer=("dstates", "places", "paths"))),
+    "cut off": lambda: (ACES, solve(ACES, max_maps=2)),
+    "levels": lambda: (ACES, solve(ACES, within=3, max_maps=None, prefer=("dstates", "places", "paths"))),
+    "levels cut off": lambda: (ACES, solve(ACES, within=3, max_maps=9, prefer=("dstates", "places", "paths"))),
     "stars": lambda: ((trace := drive(*TOURS["comb"], stars=True)), solve(trace, Theory.circumscriptive())),
     "poses": in_metres,
     "faults": misread,
     "online": online,
-    "no proof": lambda: (ACES, solve(ACES, limit=1e-4)),
+    "no proof": lambda: (ACES, solve(ACES, time_limit=1e-4)),
     "no map": lambda: (IMPOSSIBLE, solve(IMPOSSIBLE)),
-    "nothing yet": lambda: (IMPOSSIBLE, solve(IMPOSSIBLE, limit=1e-9)),
+    "nothing yet": lambda: (IMPOSSIBLE, solve(IMPOSSIBLE, time_limit=1e-9)),
     "noise": lambda: ((trace := noisy()), solve(trace, Theory.causal())),
 }
 
@@ -83,7 +83,7 @@ def test_reprs_are_short() -> None:
     assert repr(Theory.topological()) == "Theory()"
     assert repr(Speedups.without("threads")) == "Speedups(threads=False)"
     assert repr(RECTANGLE[0]) == "Step(view='v0', action='right')"
-    assert repr(solve(misread()[0], Theory.causal(), limit=1e-9)) == "<Solution feasible (time limit): 13 dstates; dstates ≥ 13>"
+    assert repr(solve(misread()[0], Theory.causal(), time_limit=1e-9)) == "<Solution feasible (time limit): 13 dstates; dstates ≥ 13>"
 
 
 @pytest.mark.parametrize("kind", SOLVED)
@@ -173,8 +173,8 @@ def test_the_version_is_that_of_the_package() -> None:
         lambda: Trace.from_steps([], []),
         lambda: Trace.load("no such file"),
         lambda: ACES[99],
-        lambda: solve(ACES, maps=-1),
-        lambda: solve(ACES, limit=float("nan")),
+        lambda: solve(ACES, max_maps=-1),
+        lambda: solve(ACES, time_limit=float("nan")),
         lambda: Theory.topological().replace(star="round"),
         lambda: Speedups.without("magic"),
         lambda: SSHMap.load("no such file"),

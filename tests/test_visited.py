@@ -58,7 +58,7 @@ def test_a_trace_with_the_names_of_true_places_has_the_true_map() -> None:
         assert (told.truth["place"], told.truth["heading"]) == (step.truth["place"], step.truth["heading"])
     found = evaluate([], named)
     assert (found.true_dstates, found.true_places, found.true_paths) == (22, 9, 6)
-    maps = solve(shipped, maps=0).maps
+    maps = solve(shipped, max_maps=None).maps
     assert [one.accuracy for one in evaluate(maps, named).maps] == [one.accuracy for one in evaluate(maps, shipped).maps]
 
     figures = judged(Events.of(named, maps[0]), truth)

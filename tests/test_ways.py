@@ -55,7 +55,7 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
     spares = data.draw(st.sampled_from([0, 2]), label="spare names")
     patience = data.draw(st.sampled_from([0, named.PATIENCE]), label="patience")
     cores = data.draw(st.sampled_from([0, named.CORES]), label="cores")
-    expected = solve(trace, theory, maps=0, speedups=PLAIN)
+    expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     if not expected.cost:
         return  # the engine is asked only where some map is known
     with patch.multiple(named, SPARES=spares, PATIENCE=patience, CORES=cores), patch.object(ways, "CONTRARY", contrary):
@@ -117,9 +117,9 @@ def test_a_maze_without_stars(off: str) -> None:
     """All minimal maps of forty steps, by whatever helps; the bound has a certificate."""
     trace = maze(2, 2, steps=40, seed=1).trace
     with patch.object(solver, "FRAME_AFTER", -1.0):
-        search = Search(trace, maps=0, speedups=Speedups.without(off))
+        search = Search(trace, max_maps=None, speedups=Speedups.without(off))
         found = search.solution(tuple(search))
-    expected = solve(trace, maps=0, speedups=Speedups.without("ways"))
+    expected = solve(trace, max_maps=None, speedups=Speedups.without("ways"))
     assert isinstance(search._prefixes.engine, FramelessEngine)
     assert set(found.maps) == set(expected.maps)
     assert found.complete
@@ -134,7 +134,7 @@ def test_the_route_of_a_robot() -> None:
     """As the table of docs/theory.md has it: (19, 9, 4), 38 maps."""
     trace = Trace.load(EXAMPLES / "aces3-route.jsonl")
     with patch.multiple(solver, FRAME_AFTER=-1.0, FEW_STEPS=0):
-        search = Search(trace, Theory(star="none"), maps=0)
+        search = Search(trace, Theory(star="none"), max_maps=None)
         found = search.solution(tuple(search))
     assert isinstance(search._prefixes.engine, FramelessEngine)
     assert found.cost
@@ -146,7 +146,7 @@ def test_the_route_of_a_robot() -> None:
 def test_maps_that_are_refused_do_not_count_among_those_that_are_listed(settled: bool) -> None:
     """Two steps may not be at one place, which they are in most of the minimal maps: few maps are no complete list, and all that are left are found."""
     trace, theory = Trace.load(EXAMPLES / "aces3-route.jsonl"), Theory(star="none", prefer=("dstates", "places", "paths"))
-    every = solve(trace, theory, maps=0).maps
+    every = solve(trace, theory, max_maps=None).maps
     pairs = [(i, j) for j in range(len(trace)) for i in range(j)]
     held = {(i, j): sum(m.place_of(i) == m.place_of(j) for m in every) for i, j in pairs}
     first, second = max((pair for pair in pairs if held[pair] < len(every)), key=lambda pair: held[pair])
@@ -159,7 +159,7 @@ def test_maps_that_are_refused_do_not_count_among_those_that_are_listed(settled:
         patch.multiple(Judging, refusal=refusal, may_refuse=True),
         patch.multiple(solver, FRAME_AFTER=-1.0 if settled else 60.0, FEW_STEPS=0 if settled else 24),
     ):
-        few, left = solve(trace, theory, maps=1), solve(trace, theory, maps=0)
+        few, left = solve(trace, theory, max_maps=1), solve(trace, theory, max_maps=None)
     assert set(left.maps) == {m for m in every if m.place_of(first) != m.place_of(second)}
     assert (left.complete, few.complete, few.count) == (True, False, 1)
     assert left.count == len(left.maps) == len(every) - held[first, second] > 1
@@ -168,7 +168,7 @@ def test_maps_that_are_refused_do_not_count_among_those_that_are_listed(settled:
 def test_few_of_many_maps() -> None:
     trace = maze(2, 2, steps=120, seed=2).trace
     with patch.object(solver, "FRAME_AFTER", -1.0):
-        few, every = solve(trace, maps=3), solve(trace, maps=0)
+        few, every = solve(trace, max_maps=3), solve(trace, max_maps=None)
     assert (few.status, few.count, few.complete, few.stopped) == (Status.OPTIMAL, 3, False, "maps limit")
     assert every.complete
     assert set(few.maps) < set(every.maps)
@@ -190,10 +190,10 @@ def test_a_robot_that_goes_on_where_that_ended() -> None:
     trace = maze(2, 2, steps=36, seed=1).trace
     first = trace.prefix(32)
     with patch.object(solver, "FRAME_AFTER", -1.0):
-        search = Search(first, maps=0)
+        search = Search(first, max_maps=None)
         before = search.solution(tuple(search))
         assert isinstance(search._prefixes.engine, FramelessEngine)
-        after = Search(trace, maps=0, after=search)
+        after = Search(trace, max_maps=None, after=search)
         found = after.solution(tuple(after))
     assert before.complete
-    assert set(found.maps) == set(solve(trace, maps=0, speedups=Speedups.without("ways")).maps)
+    assert set(found.maps) == set(solve(trace, max_maps=None, speedups=Speedups.without("ways")).maps)

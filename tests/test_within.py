@@ -43,7 +43,7 @@ def test_near_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> 
     expected = near_minimal_maps(trace, theory, within, lambda found: all(toy.allows(found) for toy in toys))
     first_paths = data.draw(st.sampled_from([1, prefixes.FIRST_PATHS]), label="first paths")
     with patch.object(prefixes, "FIRST_PATHS", first_paths):
-        solution = solve(trace, theory, maps=0, within=within, limit=LIMIT)
+        solution = solve(trace, theory, max_maps=None, within=within, time_limit=LIMIT)
     assert solution.complete
     costs = [cost.preferred_by(theory) for cost in solution.costs]
     assert costs == [cost for cost, keys in expected.items() for _ in keys]
@@ -71,7 +71,7 @@ def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
     """With stars, and places before paths, it is one of the best twelve that have 22 dstates."""
     trace = Trace.load(ACES3)
     true = [(step.truth["place"], step.truth["heading"]) for step in trace.steps if isinstance(step.truth, dict)]
-    solution = solve(trace, prefer=("dstates", "places", "paths"), maps=0, within=3)
+    solution = solve(trace, prefer=("dstates", "places", "paths"), max_maps=None, within=3)
     assert solution.complete
     assert [(level.cost.dstates, level.count) for level in solution.levels] == [(19, 6), (20, 6), (22, 12)]
     assert solution.cost == solution.levels[0].cost == Cost(19, 8, 5)
@@ -89,13 +89,13 @@ def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
 
 def test_without_an_order_behind_dstates_all_maps_of_so_few_dstates_are_listed() -> None:
     """Then the levels are what clingo counts of maps with dstates, at most one more than the least."""
-    solution = solve(Trace.load(ACES3), prefer=("dstates",), maps=0, within=1)
+    solution = solve(Trace.load(ACES3), prefer=("dstates",), max_maps=None, within=1)
     assert [(level.cost.dstates, level.count) for level in solution.levels] == [(19, 68), (20, 158)]
 
 
 @pytest.mark.parametrize(("maps", "levels"), [(3, [3]), (4, [4]), (5, [4, 1]), (7, [4, 1, 2]), (11, [4, 1, 6])])
 def test_maps_come_in_the_order_of_their_cost_up_to_as_many_as_are_asked_for(maps: int, levels: list[int]) -> None:
-    solution = solve(Trace.load(ACES3), maps=maps, within=3)
+    solution = solve(Trace.load(ACES3), max_maps=maps, within=3)
     assert [level.count for level in solution.levels] == levels
     assert solution.complete == (maps == 11)
     assert solution.stopped == (None if maps == 11 else "maps limit")
@@ -108,18 +108,18 @@ def test_near_minimal_maps_of_a_longer_trace_are_those_that_a_rule_for_their_num
     trace = Trace.load(EXAMPLE).prefix(30)
     if theory.star == "frame":
         trace = Trace.load(ACES3)
-    solution = solve(trace, theory, within=1, maps=0)
+    solution = solve(trace, theory, within=1, max_maps=None)
     assert solution.complete
     least, more = solution.levels
     text = f"% @axiom(number) Just so many dstates.\n#program check(t).\nviolation(number,t) :- query(t), #count {{ S : is(S,S) }} != {more.cost.dstates}."
-    asked = solve(trace, theory.replace(rules=(Rules("number.lp", text),)), maps=0)
+    asked = solve(trace, theory.replace(rules=(Rules("number.lp", text),)), max_maps=None)
     assert asked.cost == more.cost
     assert set(solution.maps[least.count :]) == set(asked.maps)
-    assert set(solution.maps[: least.count]) == set(solve(trace, theory, maps=0).maps)
+    assert set(solution.maps[: least.count]) == set(solve(trace, theory, max_maps=None).maps)
 
 
 def test_what_was_found_is_kept_where_a_limit_cuts_the_list() -> None:
-    search = Search(Trace.load(ACES3), Theory(star="none"), maps=0, within=3)
+    search = Search(Trace.load(ACES3), Theory(star="none"), max_maps=None, within=3)
     found = []
     for ssh_map in search:
         found.append(ssh_map)

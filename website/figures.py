@@ -59,7 +59,7 @@ def folded() -> SSHMap:
 @cache
 def rivals() -> tuple[SSHMap, ...]:
     """The minimal maps of the ACES3 route."""
-    return tuple(solve(Trace.load(EXAMPLES / "aces3-route.jsonl"), maps=0).maps)
+    return tuple(solve(Trace.load(EXAMPLES / "aces3-route.jsonl"), max_maps=None).maps)
 
 
 DRAWN: dict[str, Callable[[], str]] = {

@@ -165,11 +165,11 @@ class Question:
         search = Search(
             trace,
             self.theory,
-            limit=self.limit,
-            maps=self.maps,
+            time_limit=self.limit,
+            max_maps=self.maps or None,
             within=self.within,
             reasons=self.json,
-            memory=self.memory,
+            memory_limit=self.memory,
             speedups=self.speedups,
             on_progress=on_progress,
         )

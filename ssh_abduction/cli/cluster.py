@@ -84,7 +84,7 @@ def doubts(trace: Trace) -> list[str]:
     """What is said of the runner-up of a trace that was clustered, if it gives another map: by the default theory, or the causal one where actions have no kind."""
     theory = Theory.topological() if all(action.kind for action in trace.actions) else Theory.causal()
     try:
-        found = second_map(trace, solve(trace, theory, limit=SECONDS).maps, theory) if runner_up(trace) else None
+        found = second_map(trace, solve(trace, theory, time_limit=SECONDS).maps, theory) if runner_up(trace) else None
     except AbductionError:  # the trace lacks what the theory needs: `solve` will say so
         return []
     return [found.sentence] if found else []

@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
     question: PairQuestion | TraceQuestion
     if options.steps:
         first, second = options.steps
-        question = PairQuestion(trace, first, second, theory, maps=options.maps, **limits)
+        question = PairQuestion(trace, first, second, theory, max_maps=options.maps or None, **limits)
     else:
         question = TraceQuestion(trace, theory, **limits)
     told = _as_json if options.json else _as_text

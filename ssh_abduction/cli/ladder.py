@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
         return told(), interrupted_code()
 
     with on_ctrl_c(under_way.interrupt), Guard(under_way.interrupt, last_words, None, None) as guard:
-        for rung in ladder(trace, theory, limit=options.time_limit, maps=options.maps, under_way=under_way):
+        for rung in ladder(trace, theory, time_limit=options.time_limit, max_maps=options.maps or None, under_way=under_way):
             rungs.append(rung)
             if options.json:
                 guard.say(lambda: f"{json_line(rungs[-1].to_dict())}\n")

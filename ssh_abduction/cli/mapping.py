@@ -166,8 +166,8 @@ class MapQuestion:
                     radius=self.radius,
                     doors=self.doors,
                     name=named_after(path),
-                    limit=self.limit,
-                    maps=self.maps,
+                    time_limit=self.limit,
+                    max_maps=self.maps or None,
                     with_ladder=self.ladder,
                     mapping=begun[0][1],
                 )

@@ -88,11 +88,11 @@ def run(options: argparse.Namespace) -> int:
             search = Search(
                 trace,
                 theory,
-                limit=options.time_limit,
-                maps=options.maps,
+                time_limit=options.time_limit,
+                max_maps=options.maps or None,
                 within=options.within,
                 reasons=True,
-                memory=options.memory_limit,
+                memory_limit=options.memory_limit,
                 speedups=Speedups.without(options.without_speedups),
                 on_progress=on_progress,
             )

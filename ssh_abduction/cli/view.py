@@ -155,7 +155,7 @@ def _serve(
     from ssh_abduction.solver import end_all
 
     try:
-        server = PageServer(listing, trace, theory, run=localised, called=called, port=options.port, limit=options.time_limit)
+        server = PageServer(listing, trace, theory, run=localised, called=called, port=options.port, time_limit=options.time_limit)
     except OSError as error:
         raise AbductionError(f"--port: expected a free port, got {options.port}: {error.strerror}; name another one") from None
     with server:

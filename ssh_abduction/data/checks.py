@@ -72,6 +72,12 @@ def a_whole_number(
     raise error(f"{name}: expected {what}{_between(low, high)}, got {brief(value)}; {mend}")
 
 
+def a_count_of_maps(value: object, error: Kind) -> int | None:
+    """How many maps to list at most, 1 or more; None lists all."""
+    mend = "None lists all (--maps 0)"
+    return None if value is None else a_whole_number("max_maps (--maps)", value, error, 1, mend=mend)
+
+
 def numbers(name: str, value: object, error: Kind, length: int, what: str, mend: str = "change it") -> tuple[float, ...]:
     """So many finite numbers, from a list, a tuple or an array."""
     listed = value.tolist() if hasattr(value, "tolist") else value

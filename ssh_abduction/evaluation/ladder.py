@@ -16,7 +16,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ssh_abduction.data.checks import a_flag, a_whole_number, an_instance
+from ssh_abduction.data.checks import a_count_of_maps, a_flag, an_instance
+from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import MapError, SolverError, TheoryError
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.evaluation import Evaluation, evaluate, tells_names
@@ -81,10 +82,10 @@ class UnderWay:
         assert self.search
         return self.search.snapshot("interrupted")
 
-    def solve(self, trace: Trace, theory: Theory, *, limit: float | None, maps: int) -> Solution:
+    def solve(self, trace: Trace, theory: Theory, *, time_limit: float | None, max_maps: int | None) -> Solution:
         """Do as `ssh_abduction.solve` does. Ctrl-C that ends this search ends the others, too."""
         theory.check_steps(trace)
-        self.search = Search(trace, theory, limit=limit, maps=maps)
+        self.search = Search(trace, theory, time_limit=time_limit, max_maps=max_maps)
         if self.interrupted:  # perhaps before there was a search to be told
             self.search.interrupt()
         solution = self.search.solution(tuple(self.search))
@@ -109,12 +110,13 @@ def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[st
         yield "+ planarity", theory.replace(planar=True)
 
 
+@renamed_parameters("limit", "maps")
 def ladder(
     trace: Trace,
     theory: Theory | None = None,
     *,
-    limit: float | None = None,
-    maps: int = 100,
+    time_limit: float | None = None,
+    max_maps: int | None = 100,
     stars: bool = True,
     known: Solution | None = None,
     under_way: UnderWay | None = None,
@@ -130,22 +132,24 @@ def ladder(
     """
     checked_trace(trace)
     theory = checked_theory(theory)
-    check_limit("limit", "seconds", limit)
-    a_whole_number("maps", maps, SolverError, what="a whole number of maps, where 0 lists all")
+    check_limit("time_limit", "seconds", time_limit)
+    a_count_of_maps(max_maps, SolverError)
     a_flag("stars", stars, TheoryError)
     if known is not None:
         an_instance("known", known, Solution, MapError, mend="give what solve returned for this trace, or leave it out")
     if under_way is not None:
         an_instance("under_way", under_way, UnderWay, SolverError, mend="give an UnderWay, or leave it out")
-    return _solved(trace, theory, limit, maps, stars, known, under_way or UnderWay())
+    return _solved(trace, theory, time_limit, max_maps, stars, known, under_way or UnderWay())
 
 
 def _solved(
-    trace: Trace, theory: Theory, limit: float | None, maps: int, stars: bool, known: Solution | None, under_way: UnderWay
+    trace: Trace, theory: Theory, limit: float | None, maps: int | None, stars: bool, known: Solution | None, under_way: UnderWay
 ) -> Iterator[Rung]:
     has_truth = tells_names(trace)
     for name, chosen in rungs(trace, theory, stars):
-        solution = known if known and known.theory == chosen.resolve(trace) else under_way.solve(trace, chosen, limit=limit, maps=maps)
+        solution = (
+            known if known and known.theory == chosen.resolve(trace) else under_way.solve(trace, chosen, time_limit=limit, max_maps=maps)
+        )
         is_judged = has_truth and solution.maps and not under_way.interrupted
         yield Rung(name, solution, evaluate(solution.maps, trace) if is_judged else None)
         if under_way.interrupted:

@@ -19,7 +19,8 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
-from ssh_abduction.data.checks import a_whole_number
+from ssh_abduction.data.checks import a_count_of_maps
+from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import AbductionError, SolverError, TraceError, brief, is_whole
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View, checked_trace
 from ssh_abduction.explain.derivation import Derivation, derive
@@ -267,16 +268,16 @@ class TraceExplanation:
         }
 
 
+@renamed_parameters("limit", "maps", "memory")
 def explain_pair(
     trace: Trace,
     first: int,
     second: int,
     theory: Theory | None = None,
     *,
-    limit: float | None = None,
-    memory: int | None = None,
-    maps: int = 100,
-    **choices: Any,
+    time_limit: float | None = None,
+    memory_limit: int | None = None,
+    max_maps: int | None = 100,
 ) -> PairExplanation:
     """Why two steps of a trace are different dstates, or one, or undecided.
 
@@ -289,34 +290,37 @@ def explain_pair(
     Raises TraceError for a step that the trace does not have, or for one step twice; and as solve does.
     Source: Kuipers & Beeson 2002, section 4.2, for why x0 and x4 of the rectangle differ.
     """
-    a_whole_number("maps", maps, SolverError, what="a whole number of maps, where 0 lists all")
-    return PairQuestion(trace, first, second, checked_theory(theory).replace(**choices), limit=limit, memory=memory, maps=maps).answer()
+    a_count_of_maps(max_maps, SolverError)
+    return PairQuestion(
+        trace, first, second, checked_theory(theory), time_limit=time_limit, memory_limit=memory_limit, max_maps=max_maps
+    ).answer()
 
 
+@renamed_parameters("limit", "memory")
 def explain_trace(
-    trace: Trace, theory: Theory | None = None, *, limit: float | None = None, memory: int | None = None, **choices: Any
+    trace: Trace, theory: Theory | None = None, *, time_limit: float | None = None, memory_limit: int | None = None
 ) -> TraceExplanation:
     """Why a trace has no map, and which one observation, if it were wrong, would mend it.
 
     Parameters as in `explain_pair`. An observation is a view, a star, an action, a displacement, or what a person says of steps. Each one of the clashing
     stretch is tried: it is taken for another one of the trace, or for none, and that is a mend where the whole trace then has a map.
     """
-    return TraceQuestion(trace, checked_theory(theory).replace(**choices), limit=limit, memory=memory).answer()
+    return TraceQuestion(trace, checked_theory(theory), time_limit=time_limit, memory_limit=memory_limit).answer()
 
 
 class _Question:
     """What is asked, under limits. `answer` may be called once; `known` tells what is known so far, in any thread."""
 
-    def __init__(self, trace: Trace, theory: Theory | None, limit: float | None, memory: int | None) -> None:
-        check_limit("limit (--time-limit)", "seconds", limit)
-        check_limit("memory (--memory-limit)", "MiB", memory)
+    def __init__(self, trace: Trace, theory: Theory | None, time_limit: float | None, memory_limit: int | None) -> None:
+        check_limit("time_limit (--time-limit)", "seconds", time_limit)
+        check_limit("memory_limit (--memory-limit)", "MiB", memory_limit)
         self.trace = checked_trace(trace)
         self.theory = checked_theory(theory).resolve(trace)
         self.theory.check_steps(trace)
         check_rules(self.theory)
-        self.limit, self.memory = limit, memory
+        self.limit, self.memory = time_limit, memory_limit
         self.stopped: Stop | None = None
-        self._watch = Watch(limit, memory)
+        self._watch = Watch(time_limit, memory_limit)
         self._watch.use_reserve()
         self._search: Search | None = None
 
@@ -334,7 +338,7 @@ class _Question:
             self.stopped = limit.reason
         return self.stopped is not None
 
-    def _solved(self, trace: Trace, theory: Theory, maps: int, seconds: float) -> Search:
+    def _solved(self, trace: Trace, theory: Theory, maps: int | None, seconds: float) -> Search:
         """A search that has ended, after so many seconds at most. It is asked for its maps by `kept`."""
 
         def end_with_this(_: Progress) -> None:
@@ -342,7 +346,7 @@ class _Question:
                 search.interrupt()
 
         limit = None if seconds == float("inf") else max(seconds, SHORTEST)
-        search = self._search = Search(trace, theory, limit=limit, memory=self.memory, maps=maps, on_progress=end_with_this)
+        search = self._search = Search(trace, theory, time_limit=limit, memory_limit=self.memory, max_maps=maps, on_progress=end_with_this)
         return search
 
     def _ended(self, search: Search) -> None:
@@ -363,18 +367,18 @@ class PairQuestion(_Question):
         second: int,
         theory: Theory | None = None,
         *,
-        limit: float | None = None,
-        memory: int | None = None,
-        maps: int = 100,
+        time_limit: float | None = None,
+        memory_limit: int | None = None,
+        max_maps: int | None = 100,
     ) -> None:
-        super().__init__(trace, theory, limit, memory)
+        super().__init__(trace, theory, time_limit, memory_limit)
         for step in (first, second):
             if not is_whole(step) or not 0 <= step < len(trace):
                 raise TraceError(f"step: expected a step from 0 to {len(trace) - 1}, got {brief(step)}; steps are counted from 0")
         if first == second:
             raise TraceError(f"step: expected two steps, got {first} twice; take another one")
         self.first, self.second = int(min(first, second)), int(max(first, second))
-        self._maps = maps
+        self._maps = max_maps
         self._sides = {True: Side(), False: Side()}  # by whether the steps are one
         self._minimal = {True: False, False: False}  # whether a minimal map is such
         self._minimum: Cost | None = None
@@ -560,8 +564,10 @@ class PairQuestion(_Question):
 class TraceQuestion(_Question):
     """Asks why a trace has no map, and what would mend it. Parameters as in `explain_trace`."""
 
-    def __init__(self, trace: Trace, theory: Theory | None = None, *, limit: float | None = None, memory: int | None = None) -> None:
-        super().__init__(trace, theory, limit, memory)
+    def __init__(
+        self, trace: Trace, theory: Theory | None = None, *, time_limit: float | None = None, memory_limit: int | None = None
+    ) -> None:
+        super().__init__(trace, theory, time_limit, memory_limit)
         self._possible: bool | None = None
         self._clash: Explanation | None = None
         self._mends: list[Mend] = []

@@ -19,6 +19,7 @@ from sklearn.base import BaseEstimator
 from perception.confidence import warn_of_doubts
 from perception.recognition import cloned, recogniser
 from perception.views import ISOLATED, ViewClusterer, as_view_clusterer
+from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.labels import AmbiguousMapWarning, LearnerError, labels_of, labels_of_all, labels_on, map_of
@@ -37,7 +38,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     clusterer  makes views of images: a ViewClusterer, or a clusterer of scikit-learn's. It is cloned. ViewClusterer(random_state=0) by default,
                and with `isolated=10` where the theory allows views that are misread: images that are like no others then have no view, and disbelieving them costs little
     choose     the index of the map to take where several remain; None takes the labels on which all of them agree
-    limit      seconds for finding the map
+    time_limit seconds for finding the map
     features   makes of images what is clustered and compared: a transformer of scikit-learn's kind, cloned. None for reciprocals of ranges, and for a PanoramaTransformer of panoramas
 
     After `fit` there are features_, clusterer_, views_ and confidence_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree or an image has no view,
@@ -46,24 +47,25 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     Of several traces all images make the views, the longest trace makes the map, and the others are followed on it; n counts their steps, one after the other.
     """
 
+    @renamed_parameters("limit")
     def __init__(
         self,
         theory: Theory | None = None,
         clusterer: Any = None,
         choose: int | None = None,
-        limit: float | None = None,
+        time_limit: float | None = None,
         features: Any = None,
     ) -> None:
-        self.theory, self.clusterer, self.choose, self.limit, self.features = theory, clusterer, choose, limit, features
+        self.theory, self.clusterer, self.choose, self.time_limit, self.features = theory, clusterer, choose, time_limit, features
 
     def fit(self, X: Trace | Sequence[Trace], y: Any = None) -> BootstrapLearner:
         """Run the loop on a trace, or on several. Raises LearnerError, PerceptionError, TraceError."""
         traces, theory = Traces.of(X), checked_theory(self.theory)
         seen = self._look(traces, ISOLATED if theory.misread else None)
-        self.solution_ = solve(seen.each[seen.longest], theory, limit=self.limit)
+        self.solution_ = solve(seen.each[seen.longest], theory, time_limit=self.time_limit)
         self.map_, mapped = map_of(self.solution_, self.choose)
         log_of(__name__).info("a map of %d dstates", len(self.map_.dstates))
-        self.second_map_ = warn_of_second_map(seen.each[seen.longest], self.solution_.maps, theory, self.limit)
+        self.second_map_ = warn_of_second_map(seen.each[seen.longest], self.solution_.maps, theory, self.time_limit)
         self.labels_ = labels_of_all(self.map_, mapped, seen, self.views_, self.features_)
         sure = self.labels_ >= 0
         sure[traces.at_longest([fault.step for fault in self.map_.faults if fault.kind == "misread"])] = False

@@ -88,7 +88,7 @@ def second_map(
     other = runner_up(trace)
     if other is None:
         return None
-    solution = solve(other, theory, limit=SECONDS if limit is None else min(limit, SECONDS), memory=memory)
+    solution = solve(other, theory, time_limit=SECONDS if limit is None else min(limit, SECONDS), memory_limit=memory)
     if {partition(m) for m in maps} & {partition(m) for m in solution.maps}:
         return None
     return SecondMap(len(set(trace.views)), len(set(other.views)), len(maps[0].dstates) if maps else None, solution)

@@ -30,6 +30,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, TypeAlias
 
 from ssh_abduction.data.checks import a_function
+from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
@@ -133,20 +134,23 @@ class Explorer:
     after 7 steps the map is unique, and true: one map is left, nothing in it is untried, and no return in it is in doubt
     """
 
-    def __init__(self, robot: Robot, theory: Theory | None = None, *, margin: int = 2, limit: float | None = 2.0, maps: int = 100) -> None:
+    @renamed_parameters("limit", "maps")
+    def __init__(
+        self, robot: Robot, theory: Theory | None = None, *, margin: int = 2, time_limit: float | None = 2.0, max_maps: int | None = 100
+    ) -> None:
         if not is_whole(margin) or margin < 0:
             raise TraceError(f"margin: expected a number of dstates, 0 or more, got {brief(margin)}")
-        check_limit("limit", "seconds", limit)
+        check_limit("time_limit", "seconds", time_limit)
         for name in ("look", "can", "do"):
             a_function(f"robot.{name}", getattr(robot, name, None), TraceError, what="a method of the robot")
         if theory is not None and checked_theory(theory).has_faults:
             raise TheoryError(
                 "theory: expected one without faults, as what contradicts all maps ends an exploration, got misread or slipped; leave them out"
             )
-        self._robot, self._margin, self._limit, self._most = robot, margin, limit, maps
+        self._robot, self._margin, self._limit, self._most = robot, margin, time_limit, max_maps
         first = self._look()
         assert first.view is not None
-        self.mapper = OnlineMapper(first.view, theory, star=first.star, limit=limit, maps=maps)  # type: ignore[arg-type]
+        self.mapper = OnlineMapper(first.view, theory, star=first.star, time_limit=time_limit, max_maps=max_maps)  # type: ignore[arg-type]
         self._truths = [first.truth]
         self._actions: dict[str, Action] = {}  # all that it was ever able to do
         self._abilities: dict[tuple[object, object], set[str]] = {}  # what it can do wherever it sees this
@@ -262,7 +266,7 @@ class Explorer:
             return tour
         if not found.actions and not (self.solution.status is Status.OPTIMAL and self.solution.complete):
             longer = None if self._limit is None else LONGER * self._limit
-            self._longer = solve(self.mapper.trace, self.mapper.theory, limit=longer, maps=self._most)
+            self._longer = solve(self.mapper.trace, self.mapper.theory, time_limit=longer, max_maps=self._most)
             if self._longer.maps:
                 found = self._experiment(list(self._longer.maps))
         if found.actions or not self._margin or not self.solution.maps:
@@ -305,7 +309,7 @@ class Explorer:
         """The best map in which two steps are not where the minimal maps say, if it has few dstates more."""
         theory = self.mapper.theory
         kind = "different" if theory.level == "causal" else "elsewhere"
-        found = solve(self.mapper.trace, theory.replace(**{kind: (*getattr(theory, kind), doubt)}), maps=1, limit=self._limit)
+        found = solve(self.mapper.trace, theory.replace(**{kind: (*getattr(theory, kind), doubt)}), max_maps=1, time_limit=self._limit)
         if found.maps and len(found.maps[0].dstates) <= dstates + self._margin:
             yield found.maps[0]
             return

@@ -59,6 +59,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.checker.checker import check, unchecked
+from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
@@ -97,10 +98,11 @@ class OnlineMapper:
     confidence  how probable it is that what is seen at first is right, as in Step, where faults are allowed
     odometry  how far displacements that come without a covariance may be off, as in Trace; None for the defaults
     limit    seconds that a step may take, about: clingo cannot be stopped while it grounds a step. None waits for the exact answer
-    maps     keep at most so many maps; 0 keeps all
+    max_maps keep at most so many maps; None keeps all
     speedups  what makes solving fast, as for Search
     """
 
+    @renamed_parameters("limit", "maps")
     def __init__(
         self,
         view: View,
@@ -109,8 +111,8 @@ class OnlineMapper:
         star: Sequence[float] | None = None,
         confidence: float | None = None,
         odometry: Odometry | Mapping[str, Any] | None = None,
-        limit: float | None = 0.5,
-        maps: int = 100,
+        time_limit: float | None = 0.5,
+        max_maps: int | None = 100,
         speedups: Speedups = ALL,
     ) -> None:
         first = replace(Step.of(_known(view, 0), star, "step 0"), confidence=confidence)
@@ -119,7 +121,7 @@ class OnlineMapper:
             raise TheoryError(
                 "jumped: expected displacements that hold while a robot drives; leave it out, and give no displacement at a step where the odometry is lost"
             )
-        check_limit("limit", "seconds", limit)
+        check_limit("time_limit", "seconds", time_limit)
         checked_speedups(speedups)
         self._odometry = None if odometry is None else Odometry.of(odometry)
         self.trace = Trace((first,), odometry=self._odometry)  # the steps so far
@@ -128,13 +130,13 @@ class OnlineMapper:
         self._unsettled = theory.replace(star=settled.star)
         self._steps = [first]
         self._actions: dict[str, Action] = {}
-        self._limit, self._most, self._speedups = limit, maps, speedups
+        self._limit, self._most, self._speedups = time_limit, max_maps, speedups
         self._recovery: Recovery | None = None
         if theory.has_faults:
             from ssh_abduction.online.recovery import Recovery  # loads numpy
 
             self.theory = self._settled_theory()
-            self._recovery = Recovery(self.trace, self.theory, limit=limit, maps=maps, speedups=speedups)
+            self._recovery = Recovery(self.trace, self.theory, time_limit=time_limit, max_maps=max_maps, speedups=speedups)
             self.solution = self._recovery.solution
             return
         if theory.level == "causal":  # now rather than at the step that first needs it, as it takes its time
@@ -369,7 +371,7 @@ class OnlineMapper:
         self._searches += 1
         known = self._maps[0].map() if self._status is Status.OPTIMAL else None
         search = Search(
-            self.trace, self.theory, limit=self._limit, maps=self._most, speedups=self._speedups, after=self._search, minimal=known
+            self.trace, self.theory, time_limit=self._limit, max_maps=self._most, speedups=self._speedups, after=self._search, minimal=known
         )
         found = tuple(search.unranked())  # as that takes longer than a step may
         self._search = search

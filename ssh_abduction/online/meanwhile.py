@@ -27,23 +27,23 @@ class Solved:
     stopped: Stop | None
 
 
-def solved(trace: Trace, theory: Theory, limit: float | None, maps: int, speedups: Speedups, watch: Watch | None = None) -> Solved:
+def solved(trace: Trace, theory: Theory, limit: float | None, maps: int | None, speedups: Speedups, watch: Watch | None = None) -> Solved:
     """What `solve` finds for the steps so far."""
-    found = solve(trace, theory.of_steps(0, len(trace)), limit=limit, maps=maps, speedups=speedups)
+    found = solve(trace, theory.of_steps(0, len(trace)), time_limit=limit, max_maps=maps, speedups=speedups)
     return Solved(len(trace), found.status, found.maps, found.bound, found.complete, found.stopped)
 
 
 class Meanwhile(Beside[Solved]):
     """Solves the steps so far in a process of its own."""
 
-    def __init__(self, trace: Trace, theory: Theory, maps: int, speedups: Speedups) -> None:
+    def __init__(self, trace: Trace, theory: Theory, maps: int | None, speedups: Speedups) -> None:
         super().__init__(partial(_solve, trace, theory, maps, speedups))
 
     @staticmethod
-    def begun(trace: Trace, theory: Theory, maps: int, speedups: Speedups) -> Meanwhile | None:
+    def begun(trace: Trace, theory: Theory, maps: int | None, speedups: Speedups) -> Meanwhile | None:
         """None where there is no second processor, or processes are not wanted."""
         return Meanwhile(trace, theory, maps, speedups) if speedups.processes and has_processors(speedups) else None
 
 
-def _solve(trace: Trace, theory: Theory, maps: int, speedups: Speedups, watch: Watch) -> Solved:
+def _solve(trace: Trace, theory: Theory, maps: int | None, speedups: Speedups, watch: Watch) -> Solved:
     return in_process(solved, trace, theory, MEANWHILE, maps, speedups, watch=watch)

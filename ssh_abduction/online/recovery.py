@@ -109,9 +109,9 @@ class Recovery:
     The others are those of OnlineMapper.
     """
 
-    def __init__(self, trace: Trace, theory: Theory, *, limit: float | None, maps: int, speedups: Speedups) -> None:
+    def __init__(self, trace: Trace, theory: Theory, *, time_limit: float | None, max_maps: int | None, speedups: Speedups) -> None:
         self.searches = 0  # how often the trace was solved anew, in a step
-        self._limit, self._most, self._speedups = limit, maps, speedups
+        self._limit, self._most, self._speedups = time_limit, max_maps, speedups
         self._views = {trace.steps[0].view}
         self._known: SSHMap | None = None  # the map that was certain last, or best before
         self._broke: list[tuple[int, str]] = []  # since then

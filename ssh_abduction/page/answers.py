@@ -10,9 +10,9 @@ from ssh_abduction.theory.theory import Theory
 
 def explained(trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch) -> PairExplanation:
     """Why two steps are one dstate or not. The watch is not needed, as the process is ended from outside."""
-    return explain_pair(trace, first, second, theory, limit=limit)
+    return explain_pair(trace, first, second, theory, time_limit=limit)
 
 
 def solved(trace: Trace, theory: Theory, maps: int, limit: float | None, watch: Watch) -> Solution:
     """The minimal maps under a theory that holds what is assumed. The watch is not needed, as the process is ended from outside."""
-    return solve(trace, theory, maps=maps, limit=limit)
+    return solve(trace, theory, max_maps=maps, time_limit=limit)

@@ -62,7 +62,7 @@ def assumptions(listing: Listing, trace: Trace, theory: Theory, seconds: float) 
         if (rest := end - time.monotonic()) <= 0:
             break
         field = "different" if one else "same"
-        found = solve(trace, theory.replace(**{field: (*getattr(theory, field), pair)}), limit=rest, maps=1)
+        found = solve(trace, theory.replace(**{field: (*getattr(theory, field), pair)}), time_limit=rest, max_maps=1)
         if found.status is Status.OPTIMAL:
             tell(pair, one, Side(possible=True, cost=found.cost, proven=True))
         elif found.status is Status.UNSATISFIABLE:

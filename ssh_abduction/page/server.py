@@ -22,6 +22,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
+from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.page import answers
@@ -48,6 +49,7 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
+    @renamed_parameters("limit", "maps")
     def __init__(
         self,
         listing: Listing,
@@ -57,10 +59,10 @@ class PageServer(ThreadingHTTPServer):
         run: Run | None = None,
         called: Called | None = None,
         port: int = 0,
-        maps: int = 100,
-        limit: float | None = 30.0,
+        max_maps: int | None = 100,
+        time_limit: float | None = 30.0,
     ) -> None:
-        self._trace, self._theory, self._maps, self._limit = trace, theory, maps, limit
+        self._trace, self._theory, self._maps, self._limit = trace, theory, max_maps, time_limit
         self._run, self._called = run, called or Called(listing.source)
         self._page = html_of(content_of(listing, trace, run, self._called), served=True).encode()
         self._token = secrets.token_urlsafe(24)

@@ -40,6 +40,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ssh_abduction.data.checks import a_flag, a_function, a_list, an_instance
+from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Trace, checked_trace
@@ -220,6 +221,7 @@ class Experiment:
         } | ({"stopped": self.stopped} if self.stopped else {})
 
 
+@renamed_parameters("limit", "memory")
 def next_experiment(
     maps: Solution | SSHMap | Iterable[SSHMap],
     trace: Trace | None = None,
@@ -229,8 +231,8 @@ def next_experiment(
     actions: Iterable[Action | str] = (),
     can: Can | None = None,
     implied: bool = False,
-    limit: float | None = None,
-    memory: float | None = None,
+    time_limit: float | None = None,
+    memory_limit: float | None = None,
     watch: Watch | None = None,
 ) -> Experiment:
     """What to do next, to find out which of rival maps is true: the actions after which they predict different observations.
@@ -242,13 +244,13 @@ def next_experiment(
     actions   what else the robot can do, beside the actions that some map has a link for
     can       names of what the robot can do where this is seen; by default any of these actions, as far as the star lets it
     implied   whether it may lead through links that no rival has, but that follow from the axioms
-    limit, memory  seconds, and MiB that the process may use. When they are over, the plan so far is the answer
+    time_limit, memory_limit  seconds, and MiB that the process may use. When they are over, the plan so far is the answer
     watch     the limits of a caller that may interrupt, instead of these two
 
     Raises MapError where the maps are not of one trace, or not of this one.
     """
-    check_limit("limit", "seconds", limit)
-    check_limit("memory", "MiB", memory)
+    check_limit("time_limit", "seconds", time_limit)
+    check_limit("memory_limit", "MiB", memory_limit)
     a_flag("complete", complete, MapError)
     a_flag("implied", implied, MapError)
     if theory is not None:
@@ -265,7 +267,7 @@ def next_experiment(
     rivals = [maps] if isinstance(maps, SSHMap) else a_list("maps", maps, MapError, what="a Solution or maps")
     _check(rivals, trace)
     if watch is None:
-        watch = Watch(limit, memory)
+        watch = Watch(time_limit, memory_limit)
     watch.use_reserve()
     watch.start()
     laboratory = _Laboratory(rivals, trace, theory, extra, can, implied, watch)

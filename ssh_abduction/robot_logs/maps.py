@@ -19,6 +19,7 @@ from typing import Any
 
 from perception.places.importing import Imported, import_log
 from perception.readers.scans import RobotLog
+from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.logs import log_of
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
@@ -152,6 +153,7 @@ class LogMapping(UnderWay):
     known: Callable[[], LogMap]
 
 
+@renamed_parameters("limit", "maps")
 def map_log(
     log: RobotLog,
     theory: Theory | None = None,
@@ -161,8 +163,8 @@ def map_log(
     radius: float | None = None,
     doors: bool | None = None,
     name: str | None = None,
-    limit: float | None = None,
-    maps: int = MAPS,
+    time_limit: float | None = None,
+    max_maps: int | None = MAPS,
     with_ladder: bool = True,
     mapping: LogMapping | None = None,
 ) -> LogMap:
@@ -185,7 +187,7 @@ def map_log(
     _log.info("%d visits, %d steps", len(imported.visits), len(imported.trace))
     chosen = (theory or theory_for(imported)).replace(**choices or {})
     left = seconds_left(log, imported)
-    allowed = max(left * (1 - LADDER if with_ladder else 1), LEAST) if limit is None else limit
+    allowed = max(left * (1 - LADDER if with_ladder else 1), LEAST) if time_limit is None else time_limit
     notes = imported.notes
     climbed: list[Rung] = []
 
@@ -195,18 +197,18 @@ def map_log(
 
     mapping.known = lambda: outcome(mapping.snapshot())
     begin = time.process_time()
-    solution = mapping.solve(imported.trace, chosen, limit=allowed, maps=maps)
+    solution = mapping.solve(imported.trace, chosen, time_limit=allowed, max_maps=max_maps)
     if solution.status is Status.UNSATISFIABLE and theory is None and not {"star", "boundary", "level"} & set(choices or ()):
         bare = BARE.replace(**choices or {})
         if bare != chosen:
             chosen, notes = bare, (*notes, NO_STARS)
-            solution = mapping.solve(imported.trace, chosen, limit=allowed, maps=maps)
+            solution = mapping.solve(imported.trace, chosen, time_limit=allowed, max_maps=max_maps)
     mapping.known = lambda: outcome(solution)
     seconds["maps"] = round(time.process_time() - begin, 3)
     if with_ladder and not mapping.interrupted:
         begin, stars = time.process_time(), chosen.star != "none"
         share = (left - seconds["maps"]) / len(list(rungs(imported.trace, chosen, stars)))
         most = min(max(share, LEAST_RUNG), RUNG)
-        climbed += ladder(imported.trace, chosen, limit=most, maps=1, stars=stars, known=solution, under_way=mapping)
+        climbed += ladder(imported.trace, chosen, time_limit=most, max_maps=1, stars=stars, known=solution, under_way=mapping)
         seconds["ladder"] = round(time.process_time() - begin, 3)
     return outcome(solution, mapping.interrupted)

@@ -45,10 +45,11 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import groupby
-from typing import Any, get_args
+from typing import get_args
 
-from ssh_abduction.data.checks import a_flag, an_instance, one_of
+from ssh_abduction.data.checks import a_count_of_maps, a_flag, an_instance, one_of
 from ssh_abduction.data.clock import each_heeding, heeding
+from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import SolverError, TheoryError, brief, is_whole
 from ssh_abduction.data.logs import PROGRESS, log_of
 from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
@@ -90,37 +91,45 @@ ALL = Speedups()
 _log = log_of(__name__)
 
 
+@renamed_parameters("limit", "maps", "memory")
 def solve(
     trace: Trace,
     theory: Theory | None = None,
     *,
-    limit: float | None = None,
-    maps: int = 100,
+    time_limit: float | None = None,
+    max_maps: int | None = 100,
     within: int = 0,
-    memory: int | None = None,
+    memory_limit: int | None = None,
     speedups: Speedups = ALL,
     on_progress: Callable[[Progress], None] | None = None,
-    **choices: Any,
 ) -> Solution:
     """Find the minimal maps of a trace.
 
     theory       which axioms and which preference; Theory.topological() by default
-    limit        seconds of wall-clock time; when they are over, the best answer so far is returned
-    maps         list at most so many maps; 0 lists all (take `Search` to stream them). Where there are so many, one more is sought for a second,
+    time_limit   seconds of wall-clock time; when they are over, the best answer so far is returned
+    max_maps     list at most so many maps; None lists all (take `Search` to stream them). Where there are so many, one more is sought for a second,
                  or a tenth of the time so far: only if that ends the answer is complete
     within       list maps with up to so many dstates more than the least, too: for each number of dstates the maps that are minimal among those with just so
                  many, in the order of these numbers. Where the theory prefers few paths or places first, these are counted instead
-    memory       MiB of memory that the process may use at its peak before the search stops
+    memory_limit MiB of memory that the process may use at its peak before the search stops
     speedups     which speed-ups are on; none changes the answer
     on_progress  is told now and then how far the search is
-    choices      fields of Theory, laid over it: rules=["own.lp"], same=[(3, 12)], different=[(0, 4)], …
 
     Ctrl-C ends the search like a limit does. Raises TraceError or TheoryError where the trace lacks what the theory needs.
     Source: Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
-    theory = checked_theory(theory).replace(**choices)
+    theory = checked_theory(theory)
     theory.check_steps(checked_trace(trace))
-    search = Search(trace, theory, limit=limit, maps=maps, within=within, memory=memory, speedups=speedups, on_progress=on_progress)
+    search = Search(
+        trace,
+        theory,
+        time_limit=time_limit,
+        max_maps=max_maps,
+        within=within,
+        memory_limit=memory_limit,
+        speedups=speedups,
+        on_progress=on_progress,
+    )
     return search.solution(tuple(search))
 
 
@@ -135,15 +144,16 @@ class Search:
     minimal  a map of this trace that costs what `after` proved: it is minimal, and only the others remain to be found
     """
 
+    @renamed_parameters("limit", "maps", "memory")
     def __init__(
         self,
         trace: Trace,
         theory: Theory | None = None,
         *,
-        limit: float | None = None,
-        maps: int = 100,
+        time_limit: float | None = None,
+        max_maps: int | None = 100,
         within: int = 0,
-        memory: int | None = None,
+        memory_limit: int | None = None,
         speedups: Speedups = ALL,
         on_progress: Callable[[Progress], None] | None = None,
         reasons: bool = False,
@@ -151,16 +161,13 @@ class Search:
         minimal: SSHMap | None = None,
     ) -> None:
         checked_trace(trace)
-        if not is_whole(maps):
-            raise SolverError(f"maps (--maps): expected a whole number, 0 for all, got {brief(maps)}")
-        if maps < 0:
-            raise SolverError(f"maps (--maps): expected 0 (all) or more, got {maps}")
+        most = a_count_of_maps(max_maps, SolverError) or 0
         if not is_whole(within) or within < 0:
             raise SolverError(
                 f"within (--within): expected a whole number, 0 or more, got {brief(within)}; say how much more than the least a map may cost"
             )
-        check_limit("limit (--time-limit)", "seconds", limit)
-        check_limit("memory (--memory-limit)", "MiB", memory)
+        check_limit("time_limit (--time-limit)", "seconds", time_limit)
+        check_limit("memory_limit (--memory-limit)", "MiB", memory_limit)
         if on_progress is not None and not callable(on_progress):
             raise SolverError(f"on_progress: expected a function of one Progress, got {brief(on_progress)}")
         a_flag("reasons", reasons, SolverError)
@@ -178,7 +185,7 @@ class Search:
         self._begun = False
         self._first: SSHMap | None = None  # of the maps that were given
         self._basis: Basis | None = None  # of the certificate of the whole trace, where the search was stopped
-        self._most = maps
+        self._most = most
         self.within = int(within)
         self._mends = False  # whether maps were sought by mending the trace
         self._mended_maps: tuple[SSHMap, ...] | None = None  # the minimal maps, where these were found by mending the trace
@@ -191,8 +198,8 @@ class Search:
         self._asked_speedups = checked_speedups(speedups)
         self._on_progress = on_progress
         self._news: tuple[Cost | None, Bound] = (None, Bound())  # what was known at the last report
-        self._watch = Watch(limit, memory, self._report)
-        self.limit, self.memory = limit, memory
+        self._watch = Watch(time_limit, memory_limit, self._report)
+        self.limit, self.memory = time_limit, memory_limit
         self._watch.start()  # to compare all pairs of steps may take long
         self._task = Task.of(trace, self.theory, self._watch, speedups)
         self._known = Known(self.theory)
@@ -200,7 +207,7 @@ class Search:
         self._rivals = Rivals(self._task, self._judging)
         self._candidates = Candidates(self._task, self._known, self._judging, self._report)
         engine = self._engine_after(after) if after else self._new_engine()
-        self._prefixes = Prefixes(self._task, self._known, self._judging, engine, maps, self._report)
+        self._prefixes = Prefixes(self._task, self._known, self._judging, engine, most, self._report)
         if after:
             self._take_over(after, minimal)
         self._watch.stop()
@@ -420,9 +427,9 @@ class Search:
         search = Search(
             mended,
             theory,
-            limit=None if seconds == math.inf else max(seconds, SHORTEST),
-            maps=most,
-            memory=self.memory,
+            time_limit=None if seconds == math.inf else max(seconds, SHORTEST),
+            max_maps=most or None,
+            memory_limit=self.memory,
             speedups=self._asked_speedups,
             on_progress=end_with_this_search,
         )

@@ -100,12 +100,12 @@ def measure(name: str, seed: int) -> Run:
     world = World.named(e.world)
     trace = simulate(world, e.tours, seed)
     truth = true_dstates(trace)
-    learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(k_max=e.k_max, random_state=seed), limit=60).fit(trace)
+    learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(k_max=e.k_max, random_state=seed), time_limit=60).fit(trace)
     ranges = images_of(trace)
     quality = learner.clusterer_.quality_
     labelings = learner.clusterer_.labels_by_k_
     uncertainty = {k: uncertainty_coefficient(labels, truth) for k, labels in labelings.items()}
-    starred = solve(trace.with_views(learner.views_.tolist()), WITH_STARS, limit=60)
+    starred = solve(trace.with_views(learner.views_.tolist()), WITH_STARS, time_limit=60)
     pairs = _aliased(learner.views_, truth)
     alone = labelings[e.dstates]
     even = simulate(world, e.tours, seed, every=_step(trace))
@@ -347,7 +347,7 @@ def outcome(notch: float, scale: float, seed: int = 0) -> Outcome:
     images = ReciprocalTransformer().fit_transform(ranges)
     clusterer = ViewClusterer(k_max=10, n_init=4, random_state=seed).fit(images)
     actions = [world.route[i % len(world.route)] for i in range(len(means) - 1)]
-    solution = solve(Trace.from_steps(clusterer.labels_.tolist(), actions), VIEWS_ALONE, limit=5)
+    solution = solve(Trace.from_steps(clusterer.labels_.tolist(), actions), VIEWS_ALONE, time_limit=5)
     return Outcome(
         notch,
         scale,
